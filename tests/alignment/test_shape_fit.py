@@ -9,7 +9,7 @@ import torch
 from torchreg.alignment.align import align
 from torchreg.alignment.calibrate import CalibrateConfig, calibrate
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.person_search import swung_people
+from torchreg.alignment.person_search import limb_restarts
 from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.shape_fit import _problem, different_people
 from torchreg.errors import InputError
@@ -258,7 +258,7 @@ def test_a_limb_on_the_data_of_another_is_swung_onto_its_own(shape):
     right[:3] = pose[:3] - problem.origin[0]
     wrong = right.clone()
     wrong[arm] += torch.tensor([0.3, 1.2, 0.0])
-    swung = swung_people(problem, wrong, 3, torch.Generator().manual_seed(0))
+    swung = limb_restarts(problem, wrong, 3, torch.Generator().manual_seed(0))
     assert len(swung) == 3
     points = problem.skin(torch.stack([right, wrong, swung[0]]))
     apart = (points - points[0]).square().sum(-1).mean(-1).sqrt()

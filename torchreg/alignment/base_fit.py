@@ -37,7 +37,7 @@ class BaseFitNumbers:
     depth_std: float = 0.02  # by which all measured surfaces may lie off the true ones, along their normals
     offset_std: float = 0.05  # of a joint's offset about zero, radians: three degrees
     slide_std: float = 0.01  # the same of joints that slide
-    told: float = 0.3  # of that, which may be left of an offset that the data tell
+    max_posterior_to_prior_std: float = 0.3  # of an offset that the data determine
     space_share: float = 0.25  # of its area that a surface shows from a direction, on average (Cauchy)
 
 
@@ -51,7 +51,6 @@ class BaseProblem:
     """All frames of a calibration. A state (1, 7 + J) is the base, a depth offset in metres, and the joints' offsets.
 
     The base is a translation and a rotation vector; `shares` are the independent parts of each frame's data; `free`
-
     (J,) is True for joints with an offset.
     """
 
@@ -242,7 +241,7 @@ def fit_offsets(fit: BaseFit) -> BaseFit:
         kept = torch.cat([torch.ones(_OFFSETS, dtype=torch.bool), free])
         std = _inverse(hessian.masked_fill(~kept | ~kept.unsqueeze(-1), 0.0)).diagonal()[_OFFSETS:].sqrt()
         worst = int(torch.where(free, std / prior, 0.0).argmax())
-        if float(std[worst]) <= BASE_FIT.told * float(prior[worst]):
+        if float(std[worst]) <= BASE_FIT.max_posterior_to_prior_std * float(prior[worst]):
             break
         free[worst] = False
     state = fit.state.clone()

@@ -59,7 +59,6 @@ def search_base(frames: Sequence[BaseFrame], models: Sequence[PosedModel], size:
     """Return different candidates (K, 4, 4) ``T_camera_base``, best first, and their costs (K,).
 
     Iterated closest points with a narrowing kernel from rotations all around. Costs count data far from the model, and
-
     model points that face the camera where nothing was measured.
     """
     data = _drawn(frames)
@@ -128,7 +127,7 @@ def _step(candidates: Tensor, data: Tensor, models: Sequence[PosedModel], width:
 def _cost(
     candidates: Tensor, data: Tensor, frames: Sequence[BaseFrame], models: Sequence[PosedModel], size: float
 ) -> Tensor:
-    """Return the costs (K,) of candidates: of data far from the model, and of the model where nothing was seen."""
+    """Return the costs (K,) of candidates: of data far from the model, and of the model where nothing was measured."""
     width = _SEARCH.score_width * size
     far = _step(candidates, data, models, width)[1]
     beside = torch.zeros_like(far)
@@ -143,7 +142,7 @@ def _cost(
 
 
 def _before_data(points: Tensor, posed: Tensor) -> Tensor:
-    """Return how far posed points (K, N, 3) lie before the data (M, 3) in their direction, or beside all of them."""
+    """Return how far posed points (K, N, 3) lie before the data (M, 3) in their direction, or off all of them."""
     plane = points[:, :2] / points[:, 2:].clamp_min(1e-6)
     tree = NeighborTree(plane)
     typical = tree.k_nearest(plane, min(2, len(plane)))[1][:, -1].median()

@@ -184,7 +184,7 @@ def _calibrate_person(
     masks: Tensor | None,
     config: CalibrateConfig,
 ) -> Calibration:
-    """Return the person whom frames show: one set of coefficients, and a pose for each frame."""
+    """Return the calibration of one set of coefficients and a pose for each frame."""
     with torch.inference_mode():
         data, valid = _check_frames(shape, frames, masks, config.align.nan_policy)
         frame_poses = FramePoses.of(_check_poses(shape, initial_poses, len(data)), initial_poses is None)

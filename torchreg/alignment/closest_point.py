@@ -24,7 +24,6 @@ def closest_point(
     """Return the matches of an articulated ICP as an E-step: each datum votes for its closest model point or for none.
 
     It is an outlier beyond 1.5 sigma; ``outlier`` is not used, as all E-steps are called alike. Model (..., N, 3), data
-
     (..., M, 3) and sigma (...) in metres, mask (..., M). Besl and McKay 1992; Zhang 1994.
     """
     batch = torch.broadcast_shapes(model.shape[:-2], data.shape[:-2])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.confidence import DataOnSurface, limb_points
+from torchreg.alignment.confidence import SurfaceResiduals, limb_points
 from torchreg.alignment.observability import plausible_variance
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import AlignProblem
@@ -51,15 +51,14 @@ class Curvature:
         return self.gain <= _ERRORS.gain
 
 
-def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Curvature:
+def curvature(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Curvature:
     """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
 
     Correlated residuals, model errors per patch, wrong proportions, and chance hits of single data are included.
-
     Unobserved directions get the variance of the joint limits.
     """
-    lying = lying or DataOnSurface.of(problem, pose)
-    distance, jacobian = lying.distance, lying.jacobian
+    residuals = residuals or SurfaceResiduals.of(problem, pose)
+    distance, jacobian = residuals.distance, residuals.jacobian
     noise = surface_noise(distance, problem.valid, problem.size)
     sigma = SURFACE_FIT.width_per_noise * noise
     near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
@@ -67,7 +66,7 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
     inexact = (SURFACE_FIT.min_noise(problem.size) / noise).square() * near.sum(-1) / patches
     correlation = neighbor_correlation(problem.data, distance, near)
     shared = correlated_count(correlation) + inexact
-    if problem.told_precision is not None:
+    if problem.prior_precision is not None:
         # As the fit weighed the data against what was told.
         shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
     precision = plausible_precision(problem, pose)
@@ -76,7 +75,7 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
     if problem.landmarks is not None:
         fitted, covariance = (problem.landmarks.informed(each, pose) for each in (fitted, covariance))
     gain = _gain(problem, pose, distance, jacobian, noise, fitted) / shared.square()
-    if problem.told_precision is not None:
+    if problem.prior_precision is not None:
         # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
         error = surface_noise(distance, problem.valid, problem.size, clamped=False)
         # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
@@ -87,7 +86,7 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
-    misplaced = torch.diag_embed(_misplaced_share(problem, lying.limb_data) / precision)
+    misplaced = torch.diag_embed(_misplaced_share(problem, residuals.limb_data) / precision)
     return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, noise, shared)
 
 
@@ -95,7 +94,6 @@ def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision
     """Return the covariance of `pose_covariance` by a lower confidence limit of the data's information.
 
     The standard deviation of a sum over the data is the root of its sum of squares (Efron 1979), so that one or two
-
     data by chance determine no direction.
     """
     known = precision.double().rsqrt()
@@ -147,7 +145,7 @@ def plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
     spans = (problem.upper - problem.lower).expand_as(pose)
     plausible = plausible_variance(problem.skin.shape, problem.size, spans).reciprocal()
-    return plausible if problem.told_precision is None else torch.maximum(plausible, problem.told_precision)
+    return plausible if problem.prior_precision is None else torch.maximum(plausible, problem.prior_precision)
 
 
 def correlated_count(correlation: Tensor) -> Tensor:

@@ -29,13 +29,7 @@ from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
 from torchreg.alignment.limb_search import distinct_first, rows_in_memory, take_rows
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.pose_search import SEARCH_BUDGET, PoseSearch, mean_distances
-from torchreg.alignment.problem import (
-    AlignProblem,
-    alignment_cost,
-    centered_problem,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
 from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
@@ -174,7 +168,7 @@ def find_pose(
             find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
             locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.glance, skin))[0]
+        return surest_crop(data, model_size(skin), search, partial(source.crop_score, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
@@ -194,7 +188,7 @@ def search_everywhere(
     config: FindPoseConfig,
     known: KnownDofs | None = None,
 ) -> FoundStarts:
-    """Return what `find_pose` finds in what was seen, not far from the origin."""
+    """Return what `find_pose` finds in data near the origin."""
     seen = seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
     with torch.no_grad():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
@@ -208,12 +202,12 @@ def search_everywhere(
             free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
-            problem = known.applied(problem, shifted(known.start(shape).expand_as(typical), -origin))
+            problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
         warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
-            poses, costs = _find(problem, seen.frames, source.informed(known), config)
+            poses, costs = _find(problem, seen.frames, source.with_known(known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
@@ -240,8 +234,8 @@ def _find(
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
     poses, costs = _fitted(problem, proposed)
-    judged = without_cut(problem, poses[:, 0], frames)
-    sure = explains(judged, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
+    uncropped = without_cut(problem, poses[:, 0], frames)
+    sure = explains(uncropped, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     first = torch.zeros(len(poses), min(config.num_searched, config.num_placed), dtype=torch.int64, device=poses.device)

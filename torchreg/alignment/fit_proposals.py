@@ -73,12 +73,12 @@ def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> T
 
 
 def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
-    """Return a problem whose prior draws joints to the most probable proposal, but those of which something is told."""
+    """Return a problem whose prior's mean is the most probable proposal, except in joints with a prior."""
     mean = problem.clamp_candidates(proposals.poses[:, :1])[:, 0]
     precision = joint_precision(problem.skin.shape, problem.size, _FIT.joint_std)
-    if problem.told_precision is None:
+    if problem.prior_precision is None:
         return replace(problem, prior=GaussianPosePrior(mean, precision))
-    told, prior = problem.told_precision > 0, problem.prior
+    told, prior = problem.prior_precision > 0, problem.prior
     mean, precision = torch.where(told, prior.mean, mean), torch.where(told, prior.precision, precision)
     return replace(problem, prior=replace(prior, mean=mean, precision=precision))
 

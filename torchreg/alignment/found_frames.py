@@ -63,7 +63,7 @@ class FramePoses:
         return replace(self, poses=poses, statuses=tuple(statuses), confidence=confidence, known=known)
 
     def of_person(self, shape: ArticulatedShape, data: Tensor, valid: Tensor, config: AlignConfig) -> FramePoses:
-        """Return the poses of a person whom frames (T, M, 3) show; the first that shows one surely tells who it is."""
+        """Return the poses of a rig in frames (T, M, 3); the first sure one gives its coefficients."""
         surest, first = None, 0
         for number, (points, kept) in enumerate(zip(data, valid, strict=True)):
             found = align(shape, points[kept], fit_shape=True, config=config)

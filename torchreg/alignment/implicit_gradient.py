@@ -26,7 +26,6 @@ class FixedPoint:
     """The energy (21, 22) that the surface fit of a batch of clouds minimizes at its last width, about a start.
 
     ``E(pose) = sum_j s^2 (1 - exp(-d(Y_j, pose)^2 / s^2)) / (2 noise^2) + sum_k p_k (pose - start)_k^2 / 2``, with the
-
     difference of base rotations by composition; s is sigma (B,), p precision (num_dofs,). Dewaele et al. 2006.
     """
 
@@ -112,7 +111,6 @@ def attach_gradients(problem: FixedPoint, pose: Tensor, data: Tensor, start: Ten
     """Return a stationary pose (B, num_dofs) with its gradients in data, start and the shape's parameters.
 
     By the implicit function theorem ``d pose / d p = -H^-1 dg / dp`` over the variables within their limits, with
-
     correspondences and widths fixed (Krantz and Parks 2003; Gould et al. 2016).
     """
     return _Implicit.apply(problem, pose.detach(), data, start, *problem.parameters)

@@ -119,7 +119,8 @@ def fit_keypoints(
         prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
     )  # fmt: skip
     if known is not None:
-        problem = known.applied(problem, shifted(known.start(shape, start if start is None else near)[None], -origin))
+        given = known.start(shape, start if start is None else near)
+        problem = known.with_prior(problem, shifted(given[None], -origin))
     if start is None:
         pool, widths = _all_around(problem), _SEARCH.widths
     else:

@@ -1,4 +1,4 @@
-"""Landmarks: keypoints of the shape that a detector measured, in space or in a picture, as evidence beside the data."""
+"""Landmarks: keypoints of the shape that a detector measured, in space or in a picture."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ LANDMARKS = LandmarkModel()
 class Landmarks:
     """Measured keypoints of B problems, each a Gaussian about its true place or, with a small share, anywhere.
 
-    Targets (B, K, 3) in metres from the problems' origin, or (B, K, 2) pixels (column, row) of a camera; zero if
-    unseen.
+    Targets (B, K, 3) in metres from the origins, or (B, K, 2) pixels (column, row) of a camera; zero if unseen.
     """
 
     skin: LinearBlendSkin

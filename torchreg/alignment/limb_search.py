@@ -132,10 +132,7 @@ class LimbSearch:
         self.relative = {} if shape.kinematics.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
 
     def __call__(self, problem: AlignProblem, poses: Tensor, effort: Effort, generator: torch.Generator) -> Tensor:
-        """Return the best combinations (B, C, num_dofs) of limb configurations on given trunks, best first.
-
-        Poses (B, num_dofs) give the trunks and a configuration that is tried with the samples.
-        """
+        """Return the best limb configurations (B, C, num_dofs) on the trunks of poses (B, num_dofs), tried as well."""
         if not self.limbs:
             return poses.unsqueeze(1)
         rows = rows_in_memory(len(poses), effort.num_data * _PLACEMENT.max_tried, poses.device)
@@ -145,11 +142,11 @@ class LimbSearch:
 
     def knows(self, problem: AlignProblem, limb: Limb) -> bool:
         """Return whether the joints of a limb are known beforehand as well as samples would tell them."""
-        if problem.told_precision is None:
+        if problem.prior_precision is None:
             return False
         slides = (self.shape.upper - self.shape.lower) / _SAMPLING.slide_count
         spacing = torch.where(self.shape.is_sliding, slides, _SAMPLING.angle)[limb.dofs]
-        return bool((problem.told_precision[:, limb.dofs].rsqrt() <= spacing).all())
+        return bool((problem.prior_precision[:, limb.dofs].rsqrt() <= spacing).all())
 
     def _leader(self, follower: Limb) -> Limb:
         """Return the limb whose degrees of freedom move the first body of one that has none."""
@@ -177,7 +174,7 @@ class LimbSearch:
 
 
 class _Search:
-    """One search over a batch of problems: samples are tried on a subset of the data, combinations on ``problem``."""
+    """One search over a batch: samples are tried on a subset of the data, combinations on ``problem``."""
 
     def __init__(self, limbs: LimbSearch, problem: AlignProblem, subset: AlignProblem, effort: Effort) -> None:
         self.limbs, self.shape, self.effort, self.subset = limbs, limbs.shape, effort, subset

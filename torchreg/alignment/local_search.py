@@ -67,18 +67,9 @@ def _motion(start: Tensor, pose: Tensor) -> Tensor:
 
 
 def explore(
-    problem: AlignProblem,
-    start: Tensor,
-    descended: Tensor,
-    *,
-    candidates: int,
-    rounds: int,
-    generator: torch.Generator,
+    problem: AlignProblem, start: Tensor, descended: Tensor, *, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
-    """Return the best poses (B, num_dofs) around starts, at least as good as ``descended`` from them.
-
-    Limbs are placed anew; where that shows a wrong minimum, scattered candidates go through `PoseSearch` in one batch.
-    """
+    """Return the best poses (B, num_dofs) of limbs placed anew and, where those differ, of scattered candidates."""
     per_problem = candidates * _AROUND.data_per_candidate * problem.skin.shape.num_parts
     rows = torch.arange(len(start), device=start.device).split(max(1, _AROUND.entries // per_problem))
     state, found = generator.get_state(), []
@@ -132,7 +123,7 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     shape = problem.skin.shape
     scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
-    scale = problem.at_most_told(scale).unsqueeze(1)
+    scale = problem.cap_std_by_prior(scale).unsqueeze(1)
     noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
     around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)

@@ -114,7 +114,6 @@ class SurfaceObjective:
     """Eqs. 21 and 22: squared surface distances of the data, each weighted by ``beta = exp(-d^2 / sigma_s^2)``.
 
     Beta at every pose makes it the Welsch function ``sigma_s^2 (1 - beta) / 2``. Sigma and noise (B,) are in metres;
-
     ``lever`` is the distance of the shape's points from the base's axis of rotation.
     """
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.alignment.confidence import DataOnSurface, end_motions
+from torchreg.alignment.confidence import SurfaceResiduals, end_motions
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_objective
@@ -62,16 +62,21 @@ def spread_of(name: str, std: float, slides: bool) -> str:
 
 
 def far_variance(
-    problem: AlignProblem, pose: Tensor, lying: DataOnSurface, *, noise: Tensor, shared: Tensor, precision: Tensor
+    problem: AlignProblem,
+    pose: Tensor,
+    residuals: SurfaceResiduals,
+    *,
+    noise: Tensor,
+    shared: Tensor,
+    precision: Tensor,
 ) -> Tensor:
     """Return variances (B, num_dofs) from poses in which one joint alone is turned far, zero where those are excluded.
 
-    A pose turned by ``a``, one standard deviation without data, with an objective higher by ``E`` adds
-
-    ``a^2 exp(-E)``. It is computed for joints along whose motion the surface hardly has a slope, as of a cylinder.
+    A pose turned by ``a``, one standard deviation without data, with an objective higher by ``E`` adds ``a^2 exp(-E)``.
+    It is computed for joints along whose motion the surface hardly has a slope, as of a cylinder.
     """
-    near = welsch_weight((lying.distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square())
-    row, dof = _nearly_of_revolution(problem, pose, lying.jacobian, near * problem.valid).nonzero().unbind(-1)
+    near = welsch_weight((residuals.distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square())
+    row, dof = _nearly_of_revolution(problem, pose, residuals.jacobian, near * problem.valid).nonzero().unbind(-1)
     found = torch.zeros_like(pose)
     if len(row) == 0:
         return found

@@ -49,10 +49,7 @@ def _lies_on(problem: AlignProblem, pose: Tensor, row: int, points: Tensor) -> T
 
 
 def planes_instead(problem: AlignProblem, distance: Tensor) -> Tensor:
-    """Return by how much better a few planes explain the data on the shape, (B,), from 0 (not at all) to 1.
-
-    It is the logarithm of the ratio of the two residual noises, as a share of its range.
-    """
+    """Return by how much better a few planes explain the data on the shape, (B,), from 0 (not at all) to 1."""
     stride = -(-problem.data.shape[1] // ALTERNATIVES.num_data)
     data, distance, valid = (values[:, ::stride] for values in (problem.data, distance, problem.valid))
     on_shape = valid & (distance.abs() < ALTERNATIVES.on_shape * problem.size)

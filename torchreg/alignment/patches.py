@@ -1,4 +1,4 @@
-"""How many data are independent where whole parts err together, as by a mesh, a joint or a depth that is off."""
+"""Effective sample size under patch-correlated errors, as of a mesh, a joint or a depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is followed: the shape coefficients of one person, of which every frame tells more."""
+"""Recursive estimate of shape coefficients, frame by frame (iterated Kalman)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class PersonFilter:
         joints = joint_precision(self.rig, self._size, self._config.prior_std)
         self._precision = plausible_precision(self.rig, self._size, joints).double()
 
-    def met(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
+    def initialize(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
         """Return the pose (num_dofs,) and coefficients of a first frame; None where the shape is not found."""
         found = align(self.rig, data, start, fit_shape=True, config=self._config)
         mean, covariance = found.coefficients, found.coefficient_covariance
@@ -64,13 +64,11 @@ class PersonFilter:
             return None
         return found.pose, KnownPerson(mean, covariance)
 
-    def learned(self, person: KnownPerson, data: Tensor, pose: Tensor, viewpoint: Tensor | None = None) -> KnownPerson:
-        """Return the coefficients after another frame with a fitted pose, which counts as independent of those before.
+    def update(self, person: KnownPerson, data: Tensor, pose: Tensor, viewpoint: Tensor | None = None) -> KnownPerson:
+        """Return the coefficients after another, independent frame (M, 3) with a fitted pose.
 
         The mean minimizes ``|d(x, c)|^2_W + |x - x_0|^2_P + |c - m|^2_L``; the information L grows by the Schur
-        complement
-
-        ``H_cc - H_cx (H_xx + P)^-1 H_xc``. Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton.
+        complement ``H_cc - H_cx (H_xx + P)^-1 H_xc``. Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton.
         """
         dofs, tree = self.rig.num_dofs, self._skin.shape
         valid = torch.ones_like(data[:, 0], dtype=torch.bool)

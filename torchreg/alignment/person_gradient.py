@@ -25,10 +25,7 @@ _EXACTNESS = _Exactness()
 
 
 class PairedPlanes:
-    """Distances of data to the tangent planes of a rig's points, one for each datum.
-
-    Where planes touch a smooth surface nearest to the data, they have its first derivatives, and nearly its second.
-    """
+    """Distances of data to the tangent planes of a rig's points, one for each datum, right to first order."""
 
     def __init__(self, skin: ShapedSkin) -> None:
         self.skin = skin
@@ -50,7 +47,6 @@ def person_with_gradients(
     """Return pose (num_dofs,) and coefficients (K,) fitted to one scan (M, 3), with gradients in its points.
 
     They are those of the stationary point a few Newton steps away; correspondences and widths are held fixed, and
-
     variables at a limit have no gradient.
     """
     problem, state = fitted.problem, fitted.state

@@ -1,4 +1,4 @@
-"""Where a person of unknown size may stand: rough places and sizes of a rig with coefficients, without a start."""
+"""Global initialization of the pose and shape coefficients of a rig, and restarts of a single limb."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _PersonSearch:
     num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
     num_compared: int = 400  # best candidates, among which different ones are sought
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
-    same_swung: float = 0.03  # the same, of people of whom only one part differs
+    duplicate_limb_rms: float = 0.03  # the same, of states that differ in one limb only
     other: float = 0.05  # the same, of fitted people: what differs by more is a rival
     turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
     most_swung: float = 0.5  # of the surface: a limb that is more is not swung, as the rest would be
@@ -59,7 +59,6 @@ def find_people(
     """Return states (count, D + K) from a global search of pose and coefficients in a scan, best first.
 
     Coefficients (S, K) in evenly spread or upright rotations are registered rigidly, and ranked by unexplained data and
-
     surface.
     """
     turns = spread_rotations(_SEARCH.num_rotations) if upright is None else UprightRotations(upright).rotations(rig.up)
@@ -80,11 +79,8 @@ def find_people(
     return take_rows(best, order[:, :count])[0]
 
 
-def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return a state (D + K,) with one limb re-initialized where it explains more data, (count, D + K), best first.
-
-    A limb that begins on the data of another does not leave them. Each is sampled over its joints' ranges.
-    """
+def limb_restarts(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return a state (D + K,) with one limb re-initialized over its joints' ranges, (count, D + K), best first."""
     rig, mean, size = problem.skin.shape.rig, problem.prior.mean[0], problem.size
     bodies, drawn = find_bodies(rig), problem.draw(_SEARCH.num_data, generator)
     skin = problem.skin.subset(farthest_points(problem.skin.points, min(_SEARCH.num_points, len(problem.skin))))
@@ -113,7 +109,7 @@ def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: to
     best = take_rows(torch.cat(swung, dim=1), torch.cat(costs, dim=1).argsort(1)[:, : _SEARCH.num_compared])
     # Those who hardly differ from the given one are duplicates of it.
     best = torch.cat([state[None, None], best], dim=1)
-    order = distinct_first(mean_distances(problem, best) < _SEARCH.same_swung * size)
+    order = distinct_first(mean_distances(problem, best) < _SEARCH.duplicate_limb_rms * size)
     return take_rows(best, order[:, 1 : 1 + count])[0]
 
 
@@ -124,7 +120,7 @@ def _with_joints(state: Tensor, bodies: Sequence[Body], values: Tensor) -> Tenso
     return moved
 
 
-def turned_people(problem: ShapeProblem, state: Tensor) -> Tensor:
+def rotation_restarts(problem: ShapeProblem, state: Tensor) -> Tensor:
     """Return a state (D + K,) rotated to both sides about each axis, joints at the prior's mean, (6, D + K)."""
     num_dofs = problem.skin.shape.rig.num_dofs
     axes = torch.eye(3).to(state)

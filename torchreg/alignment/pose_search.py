@@ -1,7 +1,4 @@
-"""From many rough candidate poses to a few good ones: what the search around a start and the one without share.
-
-Candidates are fitted coarsely, pruned with their limbs placed anew, and the best few refined thoroughly.
-"""
+"""From many rough candidates to a few good poses: fitted coarsely, pruned with limbs placed anew, and refined."""
 
 from __future__ import annotations
 
@@ -69,10 +66,7 @@ SEARCH_BUDGET = _Budget()
 
 
 class PoseSearch:
-    """A search, with few data and model points, for the poses that explain most data of a batch of problems.
-
-    The generator draws the same data for every problem: a batch gives what its problems give alone.
-    """
+    """A search, with few data and model points, for the poses that explain most data of a batch of problems."""
 
     def __init__(self, problem: AlignProblem, generator: torch.Generator) -> None:
         shape = problem.skin.shape
@@ -107,10 +101,7 @@ class PoseSearch:
         return self._best_first(*self._best_options(self.coarse_problem, pool, _PRUNE, 0))[:, :count]
 
     def refine(self, candidates: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
-        """Return candidates (B, H, num_dofs) after a thorough search, best first, and their scores (B, H).
-
-        After the first round only the best candidate is searched on.
-        """
+        """Return candidates (B, H, num_dofs) after a thorough search, best first, and their scores (B, H)."""
         poses, scores = self._best_options(self.problem, candidates, _REFINE, 1)
         order = scores.argsort(1)
         poses, scores = take_rows(poses, order), scores.gather(1, order)

@@ -58,10 +58,8 @@ class AlignProblem:
     """A batch of alignments of one shape, the input of every stage.
 
     Data (B, M, 3) in metres from the origins (B, 3); `size`, the diagonal of the model at rest, is the unit of all
-
-    thresholds; `debias` is the share of the kernel's shrinkage that is corrected in the targets of the EM; normals
-
-    (B, M, 3) of the data count in the EM.
+    thresholds; `debias` is the share of the kernel's shrinkage that is corrected in the targets of the EM; normals (B,
+    M, 3) of the data count in the EM.
     """
 
     skin: LinearBlendSkin
@@ -78,7 +76,7 @@ class AlignProblem:
     debias: float = 0.0
     correspondence: str = "em"
     free_space: FreeSpaceTerm | None = None
-    told_precision: Tensor | None = None
+    prior_precision: Tensor | None = None
     landmarks: Landmarks | None = None
     normals: Tensor | None = None
 
@@ -92,7 +90,7 @@ class AlignProblem:
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index], precision=_rows(self.prior.precision, index)),
-            told_precision=None if self.told_precision is None else self.told_precision[index],
+            prior_precision=None if self.prior_precision is None else self.prior_precision[index],
             free_space=None if self.free_space is None else self.free_space.rows(index),
             landmarks=None if self.landmarks is None else self.landmarks.rows(index),
             normals=None if self.normals is None else self.normals[index],
@@ -124,24 +122,19 @@ class AlignProblem:
     def plausible_limits(self, reach: float) -> tuple[Tensor, Tensor]:
         """Return limits (B, num_dofs) of the pose, narrowed to ``reach`` standard deviations about the prior's mean."""
         lower, upper = (limit.expand_as(self.prior.mean) for limit in (self.lower, self.upper))
-        if self.told_precision is None:
+        if self.prior_precision is None:
             return lower, upper
-        width = reach * self.told_precision.rsqrt()
+        width = reach * self.prior_precision.rsqrt()
         low, high = self.prior.mean - width, self.prior.mean + width
         return torch.minimum(torch.maximum(low, lower), upper), torch.maximum(torch.minimum(high, upper), lower)
 
-    def at_most_told(self, std: Tensor) -> Tensor:
+    def cap_std_by_prior(self, std: Tensor) -> Tensor:
         """Return standard deviations (num_dofs,) as (B, num_dofs), none wider than what is known beforehand."""
         wide = std.expand_as(self.prior.mean)
-        return wide if self.told_precision is None else torch.minimum(wide, self.told_precision.rsqrt())
+        return wide if self.prior_precision is None else torch.minimum(wide, self.prior_precision.rsqrt())
 
     def solve(
-        self,
-        objective: Objective,
-        pose: Tensor,
-        max_steps: int,
-        around: Linearization,
-        damping: Tensor | None = None,
+        self, objective: Objective, pose: Tensor, max_steps: int, around: Linearization, damping: Tensor | None = None
     ) -> LMResult:
         """Return the result of Levenberg-Marquardt within the joint limits from a pose with a known linearization."""
         return levenberg_marquardt(
@@ -258,10 +251,7 @@ def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
 def alignment_cost(
     problem: AlignProblem, pose: Tensor, distances: Tensor | None = None, intruding: Tensor | float | None = None
 ) -> Tensor:
-    """Return the cost (B,) by which alignments are ranked: outliers, softly counted, free space and the prior.
-
-    Distances (B, M) and the `free_space_loss` may be precomputed.
-    """
+    """Return the cost (B,) that ranks alignments: soft counts of outliers and of points in free space, and a prior."""
     intruding = free_space_loss(problem, pose, INLIER_SHARE) if intruding is None else intruding
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clusters_beside
-from torchreg.alignment.confidence import EVIDENCE, DataOnSurface, end_spreads, limb_points, share_beside
+from torchreg.alignment.confidence import EVIDENCE, SurfaceResiduals, end_spreads, limb_points, near_outlier_share
 from torchreg.alignment.curvature import curvature, plausible_precision
 from torchreg.alignment.observability import dof_confidence, far_variance, told_open
 from torchreg.alignment.other_explanations import open_rims, planes_instead
@@ -96,10 +96,7 @@ SHAPE_CALIBRATION = Calibration(
 
 @dataclass(frozen=True)
 class SurfaceError:
-    """Standard errors, metres, of a surface fitted with its coefficients: the whole (B,), the parts (B, P).
-
-    `moved` (B,) is the root mean square by which the last step moved the surface.
-    """
+    """Standard errors (B,) of a surface fitted with its coefficients, of parts (B, P), and its last motion, metres."""
 
     whole: Tensor
     parts: Tensor
@@ -157,11 +154,11 @@ def judge(
     frames: Sequence[DepthFrame] = (),
 ) -> Judgement:
     """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`."""
-    lying = DataOnSurface.of(problem, pose)
-    around, spreads = curvature(problem, pose, lying), end_spreads(problem, pose, lying)
-    evidence, calibration = gather_evidence(problem, pose, lying.distance, lead, spreads), CALIBRATION
+    residuals = SurfaceResiduals.of(problem, pose)
+    around, spreads = curvature(problem, pose, residuals), end_spreads(problem, pose, residuals)
+    evidence, calibration = gather_evidence(problem, pose, residuals.distance, lead, spreads), CALIBRATION
     if frames:
-        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, lying.distance)
+        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, residuals.distance)
         evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
     converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
     if error is not None:
@@ -169,7 +166,7 @@ def judge(
         limbs = [limb for limb, _ in limb_points(problem.skin)]
         converged, loose = error.converged, error.loose(limbs, problem.size)
     shape, precision = problem.skin.shape, plausible_precision(problem, pose)
-    far = far_variance(problem, pose, lying, noise=around.noise, shared=around.shared, precision=precision)
+    far = far_variance(problem, pose, residuals, noise=around.noise, shared=around.shared, precision=precision)
     diagonal = around.covariance.diagonal(dim1=-2, dim2=-1)
     covariance = around.covariance + torch.diag_embed((far - diagonal).clamp_min(0))
     left_open = [told_open(shape, row, problem.size) for row in covariance]
@@ -180,7 +177,8 @@ def judge(
         evidence=evidence,
         confidence=confidence_of(evidence.table(), calibration),
         doubt=tuple(
-            "; ".join(filter(None, row)) for row in zip(told_doubts(problem, evidence, loose), left_open, strict=True)
+            "; ".join(filter(None, row))
+            for row in zip(doubt_messages(problem, evidence, loose), left_open, strict=True)
         ),
     )
 
@@ -196,7 +194,7 @@ def gather_evidence(
     return weigh(
         problem,
         distance,
-        beside=share_beside(problem, distance),
+        beside=near_outlier_share(problem, distance),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
         spread=spreads.mean(-1),
         intruding=free_space_loss(problem, pose, INLIER_SHARE),
@@ -240,7 +238,7 @@ def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> T
     return torch.sigmoid(calibration.bias - evidence @ evidence.new_tensor(calibration.weights))
 
 
-def told_doubts(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
+def doubt_messages(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
     """Return the doubts about poses, a sentence each, empty where there is none; loose (B, L) limbs are named."""
     limbs = [limb for limb, _ in limb_points(problem.skin)]
     sentences = []

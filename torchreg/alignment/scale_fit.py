@@ -81,18 +81,11 @@ class ScaleProblem:
     """The poses of all frames and the scales of the shape as one least-squares problem.
 
     A state is one row: the poses of all frames, lengths, radii. The shape carries the scales of the last state
-
     evaluated. At most ``max_points`` of each frame's data (T, M, 3) count.
     """
 
     def __init__(
-        self,
-        shape: ArticulatedShape,
-        data: Tensor,
-        valid: Tensor,
-        prior: ScalePrior,
-        size: float,
-        max_points: int,
+        self, shape: ArticulatedShape, data: Tensor, valid: Tensor, prior: ScalePrior, size: float, max_points: int
     ) -> None:
         self.shape, self.size = shape, size
         # Strides rather than draws: frames are in no order that matters, and the result is the same every time.

@@ -1,4 +1,4 @@
-"""What a shape that is not quite the measured one does to a pose: a covariance beside that of the noise."""
+"""Model-error ("consider") covariance of a pose, in addition to that of the noise."""
 
 from __future__ import annotations
 
@@ -24,13 +24,9 @@ def shape_covariance(
     """Return the "consider" covariance (B, D, D) of a pose by errors of a shape of solids; zero for meshes.
 
     Scales off by s move the pose by ``-G s``, ``G = C J^T S``, and leave residuals ``(S - J G) s``; C is the covariance
-
     of the fit, J and S its weighted Jacobians by pose and scales. With a standard deviation tau of the scales the
-
     covariance is ``tau^2 G G^T``; tau is estimated from the ``share`` (B,) of the residuals' variance that neighbors
-
     share (Schmidt 1966). The whole surface may also be offset by `SURFACE_FIT.min_noise`, which leaves no residual from
-
     one side: of the hands of ``benchmarks/confidence.py --calibrate`` the true poses are likeliest at 0.25 to 0.3 mm.
     """
     if not isinstance(problem.surface, FusedSurface):

@@ -15,13 +15,8 @@ from torchreg.alignment.clusters import leaves_clusters
 from torchreg.alignment.confidence import EVIDENCE, end_variances
 from torchreg.alignment.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.person_search import find_people, lead_over_rivals, swung_people, turned_people
-from torchreg.alignment.problem import (
-    BROAD_PRIOR,
-    joint_precision,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.person_search import find_people, lead_over_rivals, limb_restarts, rotation_restarts
+from torchreg.alignment.problem import BROAD_PRIOR, joint_precision, masked_mean, model_size
 from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.shape_problem import ShapeProblem
@@ -75,7 +70,6 @@ class FittedShape:
     """Poses (T, D) and coefficients (K,) of a fit, with covariances (T, D + K, D + K) in tangent coordinates.
 
     `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
-
     state is worse in a search.
     """
 
@@ -118,7 +112,6 @@ def fit_coefficients(
     """Return the poses of T scans (T, M, 3) of one shape and the coefficients that they share.
 
     Annealed EM, with normals, registers shapes of different sizes; the best are fitted to the surface, coefficients as
-
     further columns of the normal equations. Poses (T, num_dofs) are at the mean coefficients; None searches one scan's.
     """
     generator = torch.Generator().manual_seed(config.seed)
@@ -169,9 +162,9 @@ def _explained_anew(
     one = problem.rows(best)
     if not bool(leaves_clusters(one, state[best])):
         return state
-    others = [(swung_people(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
+    others = [(limb_restarts(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
     if searched:
-        others.append((turned_people(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
+        others.append((rotation_restarts(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
     # A chain without branches has no limb to swing.
     others = [(start, widths) for start, widths in others if len(start)]
     if not others:
@@ -208,7 +201,6 @@ def _with_learned_spread(
     """Return the problem with the deviations of alike coefficients learned, and states (T, D + K) fitted.
 
     The deviation of greatest evidence is ``s^2 = sum_k (c_k - m_k)^2 / sum_k g_k``, ``g_k = 1 - C_kk / s^2`` with the
-
     covariance C (MacKay 1992, eq. 4.9); the prior's guess counts as one more coefficient.
     """
     space, dofs = problem.skin.shape.space, problem.skin.shape.rig.num_dofs
@@ -356,11 +348,7 @@ def _problem(
 
 
 def _found(
-    problem: ShapeProblem,
-    rig: ArticulatedShape,
-    people: Tensor,
-    generator: torch.Generator,
-    upright: Direction | None,
+    problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator, upright: Direction | None
 ) -> tuple[ShapeProblem, Tensor]:
     """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
     one = problem.rows(torch.zeros(1, dtype=torch.int64)).sample(SHAPE_FIT.coarse_data, generator)

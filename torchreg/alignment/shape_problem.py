@@ -58,12 +58,7 @@ class ShapeProblem(AlignProblem):
         return alignment_cost(self, state).unflatten(0, (-1, self.scans)).sum(-1)
 
     def solve(
-        self,
-        objective: Objective,
-        pose: Tensor,
-        max_steps: int,
-        around: Linearization,
-        damping: Tensor | None = None,
+        self, objective: Objective, pose: Tensor, max_steps: int, around: Linearization, damping: Tensor | None = None
     ) -> LMResult:
         """Return the result of Levenberg-Marquardt, see `AlignProblem.solve`, with coefficients shared."""
         if self.scans == 1:

@@ -102,9 +102,8 @@ class SigmaSchedule:
 def estimate_sigma(matches: EStep, before: Tensor, after: Tensor) -> Tensor:
     """Return the sigma (...) that the M-step of a conventional EM estimates from the points (..., N, 3) that it moved.
 
-    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)``, zero where all data are outliers. Dewaele et
-
-    al. 2006, section 3.3; Myronenko and Song 2010.
+    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)``, zero without inliers. Dewaele et al. 2006,
+    3.3.
     """
     decrease = (before - matches.targets).square().sum(-1) - (after - matches.targets).square().sum(-1)
     squares = matches.squared_error - (matches.weights * decrease).sum(-1)

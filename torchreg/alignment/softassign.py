@@ -29,13 +29,10 @@ def softassign(
     """Return lambda_i, G_i and the total match of every datum under one-to-one soft assignment, as an E-step.
 
     ``m_ij = u_i exp(-|Y_j - X_i|^2 / 2 sigma^2) v_j`` is normalized in turn along rows and columns (Sinkhorn), each
-    with
-
-    an entry for "no partner": ``sum_j m_ij + b u_i = 1`` (b is ``model_outlier``), ``sum_i m_ij + c v_j = 1`` (c is
-
-    ``outlier``); only b c matters. They bound u by 1 / b and v by 1 / c at any sigma. At most ``sweeps``, until a row's
-
-    factor changes by less than ``tolerance``. Gold et al. 1998, Rangarajan et al. 1997; Dewaele et al. 2006, section 4.
+    with an entry for "no partner": ``sum_j m_ij + b u_i = 1`` (b is ``model_outlier``), ``sum_i m_ij + c v_j = 1`` (c
+    is ``outlier``); only b c matters. They bound u by 1 / b and v by 1 / c at any sigma. At most ``sweeps``, until a
+    row's factor changes by less than ``tolerance``. Gold et al. 1998, Rangarajan et al. 1997; Dewaele et al. 2006,
+    section 4.
     """
     sigma = torch.as_tensor(sigma, dtype=model.dtype, device=model.device)
     outlier = torch.as_tensor(outlier, dtype=model.dtype, device=model.device)

@@ -54,7 +54,6 @@ def fit_surface(
     """Return the pose (B, num_dofs) fitted to the data, eqs. 21 and 22, with a kernel that narrows to the noise.
 
     ``steps`` damped steps per width, shares of the model's size; the last takes up to three times as many, tested.
-
     Dewaele et al. 2006, section 3.4.
     """
     noise = torch.full_like(pose[:, 0], SURFACE_FIT.max_noise(problem.size))
@@ -133,10 +132,7 @@ def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 
 def surface_noise(distance: Tensor, valid: Tensor, size: float, *, clamped: bool = True) -> Tensor:
-    """Return the robust standard deviation (...) of valid distances (..., M) near the surface of a model, metres.
-
-    It is ``clamped`` to a range of the size, at whose upper end it lies where nothing is near.
-    """
+    """Return the robust standard deviation (...) of distances (..., M) near the surface, ``clamped`` by the size."""
     distance = distance.abs()
     near = (distance < SURFACE_FIT.widths[-1 if clamped else 0] * size) & valid
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
