@@ -8,7 +8,6 @@ import torch
 import torchreg as tr
 from torchreg.alignment.inputs import Observation
 from torchreg.datasets.hand import make_hand_cloud, surface_skin
-from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import rasterize
 from torchreg.solvers.e_step import posterior
 
@@ -129,7 +128,7 @@ def test_a_depth_frame_of_many_points_is_fitted_at_a_coarser_grid(links, links_s
     pose[:6] = torch.tensor([-0.1, 0.0, 0.6, 0.0, 1.4, 0.0])
     pose[6:] = torch.tensor([0.3, 0.2])
     surface = surface_skin(links)
-    raster = rasterize(TriangleMesh(surface(pose), surface.faces), camera.view())
+    raster = rasterize(tr.TriangleMesh(surface(pose), surface.faces), camera.view())
     frame = tr.DepthFrame(torch.where(raster.face_index >= 0, raster.depth, 0.0), camera, max_points=100_000)
     frame = frame.cropped(frame.measured)
     assert len(frame.points) > 10_000

@@ -6,16 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.alignment.problem import INLIER_SHARE, PRIOR_SHARE, alignment_cost, centered_problem, masked_mean
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.hand import Hand
-from torchreg.shapes.link_surface import LinkSurface
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import sample_skin
-from torchreg.shapes.spec import RigSurface
-from torchreg.shapes.surface import FusedSurface, SkinSurface
 
 
 def offset(*place):
@@ -40,7 +35,7 @@ def machine():
         Joint("hinge", 4, offset(0, 0, 0.2), *turn[0]),
     ))  # fmt: skip
     frames = ["mast", "ball_z", "slide", "hinge"]
-    return ArticulatedShape(tree, frames, [ROD] * 4, nu=0.01, free_base=False).requires_grad_(False)
+    return tr.ArticulatedShape(tree, frames, [ROD] * 4, nu=0.01, free_base=False).requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +51,6 @@ def problem(plain_hand, plain_hand_skin):
     )
 
 
-def test_the_mean_is_of_valid_data():
-    data = torch.tensor([[[1.0, 2, 3], [3, 4, 5], [100, 100, 100]], [[7.0, 7, 7]] * 3])
-    valid = torch.tensor([[True, True, False], [False] * 3])
-    torch.testing.assert_close(masked_mean(data, valid), torch.tensor([[2.0, 3, 4], [0, 0, 0]]))
-
-
 def test_data_and_prior_are_centered_and_padding_is_zero(problem):
     assert float(masked_mean(problem.data, problem.valid).abs().max()) < 1e-6
     assert bool((problem.data[~problem.valid] == 0).all())
@@ -73,15 +62,8 @@ def test_data_and_prior_are_centered_and_padding_is_zero(problem):
     assert problem.debias == 0.5
 
 
-def test_poses_are_shifted_by_their_bases():
-    pose = torch.arange(14.0).reshape(2, 7)
-    moved = shifted(pose, torch.tensor([1.0, 10.0, 100.0]))
-    assert moved[1].tolist() == [8.0, 18.0, 109.0, 10.0, 11.0, 12.0, 13.0]
-    assert pose[1, 0] == 7
-
-
 def test_a_bolted_base_has_limits_of_its_own_for_each_cloud(machine):
-    skin, pose = sample_skin(machine, 60), machine.rest_pose().repeat(2, 1)
+    skin, pose = tr.sample_skin(machine, 60), machine.rest_pose().repeat(2, 1)
     data = skin(pose) + torch.tensor([[[0.0, 0, 0]], [[0.05, 0, 0]]])
     valid = torch.ones(2, 60, dtype=torch.bool)
     origin = masked_mean(data, valid)
@@ -96,18 +78,8 @@ def test_a_bolted_base_has_limits_of_its_own_for_each_cloud(machine):
     torch.testing.assert_close(fixed.rows(torch.tensor([1])).lower[0, :3], -origin[1])
 
 
-def test_free_bases_share_their_limits(problem, plain_hand):
-    assert problem.lower is plain_hand.lower
-    part = problem.rows(torch.tensor([2, 0, 0]))
-    assert part.lower is plain_hand.lower
-    torch.testing.assert_close(part.data, problem.data[[2, 0, 0]])
-    torch.testing.assert_close(part.valid, problem.valid[[2, 0, 0]])
-    torch.testing.assert_close(part.prior.mean, problem.prior.mean[[2, 0, 0]])
-    torch.testing.assert_close(part.prior.precision, problem.prior.precision)
-
-
 def precision_of(shape, std):
-    skin, pose = sample_skin(shape, 60), shape.rest_pose().unsqueeze(0)
+    skin, pose = tr.sample_skin(shape, 60), shape.rest_pose().unsqueeze(0)
     data, valid = skin(pose), torch.ones(1, 60, dtype=torch.bool)
     return centered_problem(skin, data, valid, pose, masked_mean(data, valid), prior_std=std, pose_atol=1e-3)
 
@@ -120,27 +92,6 @@ def test_the_prior_holds_joints_slides_by_the_size_and_balls_as_a_whole(machine)
     assert bool((precision_of(machine, None).prior.precision == 0).all())
 
 
-def test_joints_that_follow_a_slide_are_slides():
-    tree = KinematicTree((
-        Joint("palm", -1, offset(0, 0, 0)),
-        Joint("jaw", 0, offset(0.1, 0, 0), "prismatic", (1.0, 0.0, 0.0), 0.0, 0.1),
-        Joint("other", 0, offset(-0.1, 0, 0), "prismatic", (1.0, 0.0, 0.0), mimic=(1, -1.0, 0.0)),
-    ))  # fmt: skip
-    held = precision_of(ArticulatedShape(tree, ["palm", "jaw", "other"], [ROD] * 3, nu=0.01), 0.5)
-    assert held.prior.precision[6:].tolist() == pytest.approx([1 / (0.5 * held.size) ** 2])
-
-
-def test_shapes_with_a_mesh_are_fitted_by_it(plain_hand, problem):
-    assert isinstance(problem.surface, FusedSurface)
-    mesh = plain_hand.surface_mesh(spacing=0.01)
-    weights = torch.nn.functional.one_hot(torch.zeros(len(mesh.vertices)).long(), 16).float()
-    rigged = Hand().requires_grad_(False)
-    rigged.surface = RigSurface(mesh.vertices, mesh.faces, weights)
-    assert isinstance(precision_of(rigged, 0.3).surface, LinkSurface)
-    weights[0, :2] = 0.5
-    assert isinstance(precision_of(rigged, 0.3).surface, SkinSurface)
-
-
 def test_a_draw_takes_data_that_count_and_no_datum_twice(problem):
     drawn = problem.draw(60, torch.Generator().manual_seed(0))
     assert drawn.data.shape == (3, 60, 3)
@@ -151,36 +102,6 @@ def test_a_draw_takes_data_that_count_and_no_datum_twice(problem):
     again = problem.draw(60, torch.Generator().manual_seed(0))
     torch.testing.assert_close(again.data, drawn.data, rtol=0, atol=0)
     assert not torch.equal(problem.draw(60, torch.Generator().manual_seed(1)).data, drawn.data)
-
-
-def test_a_draw_of_more_than_there_are_is_all_of_them(problem):
-    drawn = problem.draw(1000, torch.Generator().manual_seed(0))
-    assert drawn.data.shape == problem.data.shape
-    assert drawn.valid.sum(-1).tolist() == [400, 300, 50]
-    torch.testing.assert_close(drawn.data.sum(1), problem.data.sum(1), rtol=0, atol=1e-5)
-
-
-def test_a_draw_leaves_the_global_state_alone(problem):
-    torch.manual_seed(3)
-    state = torch.get_rng_state()
-    problem.draw(10, torch.Generator().manual_seed(0))
-    assert bool((torch.get_rng_state() == state).all())
-
-
-def test_changes_are_radians_or_shares_of_the_size(problem):
-    step = torch.zeros(3, 27)
-    step[0, 1], step[1, 4], step[2, 20] = -0.5 * problem.size, -0.25, 0.125
-    torch.testing.assert_close(problem.change(step), torch.tensor([0.5, 0.25, 0.125]))
-
-
-def test_poses_are_clamped_between_the_limits(problem, plain_hand):
-    wild = 5 * torch.randn(7, 3, 27, generator=torch.Generator().manual_seed(0))
-    found = problem.clamp(wild)
-    inside = (wild >= plain_hand.lower) & (wild <= plain_hand.upper)
-    assert bool((found == wild)[inside].all())
-    at_limit = (found == plain_hand.lower) | (found == plain_hand.upper)
-    assert bool(at_limit[~inside].all())
-    torch.testing.assert_close(found[..., :6], wild[..., :6])
 
 
 def test_the_cost_counts_outliers_and_asks_the_prior(problem, plain_hand):
