@@ -231,11 +231,11 @@ def given(plain_hand, plain_hand_skin, links, person, tmp_path_factory):
         (lambda g: tr.find_pose(g.links, None, keypoints=torch.zeros(2, 3, 3)), INPUT, "alone must be of one frame"),
         # Shape coefficients
         (of_person(fit_shape="all"), INPUT, "fit_shape must be True, False or 'bones', got 'all'"),
-        (of_person(fit_shape=True, locked=["base"]), INPUT, "goes without model_points, keypoints, locked and prior"),
+        (of_person(fit_shape=True, locked=["base"]), INPUT, "without model_points, keypoints, locked and prior"),
         (of_person("plain", fit_shape=True), INPUT, "has no coefficients"),
         (of_person(data=FRAMES, fit_shape=True), INPUT, "takes one cloud; calibrate fits several"),
         # The base of a robot
-        (base([{"turn": 0.1, "elbow": 0.2}]), INPUT, r"poses\[0\] lacks joint 'wrist'; the robot's joints are turn, el"),
+        (base([{"turn": 0.1, "elbow": 0.2}]), INPUT, r"poses\[0\] lacks joint 'wrist'; the robot's joints are turn"),
         (base([[17.0, 51.0, -23.0]]), INPUT, r"poses\[0\] has joint 'turn' at 17, .*as degrees all would fit"),
         (base([[0.1, 2.6, 0.0]]), INPUT, "'elbow' at 2.6, beyond its limits -2.2 to 2.2; check units and order"),
         (base([[0.1, 0.2]]), INPUT, r"must have shape \(1, 3\), the joints turn, elbow, wrist, .* got \(1, 2\)"),

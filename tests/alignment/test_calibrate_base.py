@@ -7,16 +7,15 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.alignment.made import ARM
+from tests.alignment.made import ARM, offset
 from torchreg.alignment.base_frames import read_joints
-from torchreg.geometry.rigid import rigid_matrix, transform_points
+from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import sample_visible
 
 JOINTS = torch.tensor([[0.3, 0.9, -0.4], [-0.8, -1.1, 0.7], [1.6, 0.5, 1.1]], dtype=torch.float64)
-BASE = rigid_matrix(
-    so3_exp(torch.tensor([[1.9, -0.4, 0.7]], dtype=torch.float64))[0], torch.tensor([0.1, 0.25, 1.2]).double()
-)
+BASE = offset(0.1, 0.25, 1.2)
+BASE[:3, :3] = so3_exp(torch.tensor([1.9, -0.4, 0.7], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")

@@ -7,35 +7,21 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.problem import INLIER_SHARE, PRIOR_SHARE, alignment_cost, centered_problem, masked_mean
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.primitives import Primitive
-
-
-def offset(*place):
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = torch.tensor(place, dtype=torch.float64)
-    return pose
-
-
-ROD = Primitive("capsule", (0.1, 0.02), offset(0, 0, 0.05))
+from tests.alignment.made import generator, joint, problem_of, shape_of, solid
+from torchreg.alignment.problem import INLIER_SHARE, PRIOR_SHARE, alignment_cost
 
 
 @pytest.fixture(scope="module")
 def machine():
     """A bolted mast with a ball joint, a slide and a hinge behind one another."""
-    turn = [("revolute", axis, -1.0, 1.0) for axis in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))]
-    tree = KinematicTree((
-        Joint("mast", -1, offset(0, 0, 0)),
-        Joint("ball_x", 0, offset(0, 0, 0.2), *turn[0]),
-        Joint("ball_y", 1, offset(0, 0, 0), *turn[1]),
-        Joint("ball_z", 2, offset(0, 0, 0), *turn[2]),
-        Joint("slide", 3, offset(0.1, 0, 0.1), "prismatic", (0.0, 0.0, 1.0), 0.0, 0.2),
-        Joint("hinge", 4, offset(0, 0, 0.2), *turn[0]),
-    ))  # fmt: skip
-    frames = ["mast", "ball_z", "slide", "hinge"]
-    return tr.ArticulatedShape(tree, frames, [ROD] * 4, nu=0.01, free_base=False).requires_grad_(False)
+    x, y, z = (("revolute", axis, -1.0, 1.0) for axis in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)))
+    joints = [
+        joint("mast", -1), joint("ball_x", 0, (0, 0, 0.2), *x), joint("ball_y", 1, (0, 0, 0), *y),
+        joint("ball_z", 2, (0, 0, 0), *z), joint("hinge", 4, (0, 0, 0.2), *x),
+    ]  # fmt: skip
+    joints.insert(4, joint("slide", 3, (0.1, 0, 0.1), "prismatic", (0.0, 0.0, 1.0), 0.0, 0.2))
+    rods = [solid("capsule", (0.1, 0.02), 0, 0, 0.05)] * 4
+    return shape_of(joints, rods, ["mast", "ball_z", "slide", "hinge"], free_base=False)
 
 
 @pytest.fixture(scope="module")
@@ -46,42 +32,39 @@ def problem(plain_hand, plain_hand_skin):
     pose[:, 6:] = torch.tensor([[0.1], [0.2], [0.3]])
     data = plain_hand_skin(pose)
     valid = torch.arange(400) < torch.tensor([[400], [300], [50]])
-    return centered_problem(
-        plain_hand_skin, data, valid, pose, masked_mean(data, valid), prior_std=0.25, pose_atol=1e-3, debias=0.5
-    )
+    origin = torch.stack([points[known].mean(0) for points, known in zip(data, valid, strict=True)])
+    return problem_of(plain_hand_skin, data, pose, valid, origin, prior_std=0.25)
 
 
 def test_data_and_prior_are_centered_and_padding_is_zero(problem):
-    assert float(masked_mean(problem.data, problem.valid).abs().max()) < 1e-6
+    assert float(problem.data.sum(1).abs().max()) < 1e-4
     assert bool((problem.data[~problem.valid] == 0).all())
     # The same offset moved data and poses: the prior's pose still lies on its data.
     far = problem.skin(problem.prior.mean) - problem.data
     assert float(far[problem.valid].abs().max()) < 1e-6
     rest = problem.skin.points
     assert problem.size == pytest.approx(float((rest.amax(0) - rest.amin(0)).norm()))
-    assert problem.debias == 0.5
 
 
 def test_a_bolted_base_has_limits_of_its_own_for_each_cloud(machine):
     skin, pose = tr.sample_skin(machine, 60), machine.rest_pose().repeat(2, 1)
     data = skin(pose) + torch.tensor([[[0.0, 0, 0]], [[0.05, 0, 0]]])
-    valid = torch.ones(2, 60, dtype=torch.bool)
-    origin = masked_mean(data, valid)
-    fixed = centered_problem(skin, data, valid, pose, origin, prior_std=0.3, pose_atol=1e-3)
+    origin = data.mean(1)
+    fixed = problem_of(skin, data, pose, origin=origin)
     torch.testing.assert_close(fixed.lower[:, :3], -origin)
     torch.testing.assert_close(fixed.upper[:, :3], -origin)
     torch.testing.assert_close(fixed.upper[:, 6:], machine.upper[6:].expand(2, -1))
     # Clamped, a base is back where it is bolted.
-    wild = torch.randn(5, 2, machine.num_dofs, generator=torch.Generator().manual_seed(0))
-    clamped = shifted(fixed.clamp(wild), origin)
-    assert float(clamped[..., :6].abs().max()) < 1e-6
+    wild = torch.randn(5, 2, machine.num_dofs, generator=generator())
+    clamped = fixed.clamp(wild)
+    assert float((clamped[..., :3] + origin).abs().max()) < 1e-6
+    assert float(clamped[..., 3:6].abs().max()) < 1e-6
     torch.testing.assert_close(fixed.rows(torch.tensor([1])).lower[0, :3], -origin[1])
 
 
 def precision_of(shape, std):
     skin, pose = tr.sample_skin(shape, 60), shape.rest_pose().unsqueeze(0)
-    data, valid = skin(pose), torch.ones(1, 60, dtype=torch.bool)
-    return centered_problem(skin, data, valid, pose, masked_mean(data, valid), prior_std=std, pose_atol=1e-3)
+    return problem_of(skin, skin(pose), pose, prior_std=std)
 
 
 def test_the_prior_holds_joints_slides_by_the_size_and_balls_as_a_whole(machine):
@@ -93,15 +76,15 @@ def test_the_prior_holds_joints_slides_by_the_size_and_balls_as_a_whole(machine)
 
 
 def test_a_draw_takes_data_that_count_and_no_datum_twice(problem):
-    drawn = problem.draw(60, torch.Generator().manual_seed(0))
+    drawn = problem.draw(60, generator())
     assert drawn.data.shape == (3, 60, 3)
     assert drawn.valid.sum(-1).tolist() == [60, 60, 50]
     same = (drawn.data.unsqueeze(2) == problem.data.unsqueeze(1)).all(-1) & problem.valid.unsqueeze(1)
     assert bool((same.any(-1) == drawn.valid).all())
     assert all(len(drawn.data[row][drawn.valid[row]].unique(dim=0)) == count for row, count in enumerate((60, 60, 50)))
-    again = problem.draw(60, torch.Generator().manual_seed(0))
+    again = problem.draw(60, generator())
     torch.testing.assert_close(again.data, drawn.data, rtol=0, atol=0)
-    assert not torch.equal(problem.draw(60, torch.Generator().manual_seed(1)).data, drawn.data)
+    assert not torch.equal(problem.draw(60, generator(1)).data, drawn.data)
 
 
 def test_the_cost_counts_outliers_and_asks_the_prior(problem, plain_hand):
