@@ -236,6 +236,7 @@ def tip_errors(hand, poses, truth, true_poses, clouds):
     return off[torch.tensor(seen)]
 
 
+@pytest.mark.slow
 def test_a_hand_of_other_proportions_seen_from_one_side(plain_hand, other_hand):
     """Three frames of 500 points, 1.5 mm noise, a third outliers; then new frames are fitted with the shape found."""
     truth, poses, clouds, starts = other_hand

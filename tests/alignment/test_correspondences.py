@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchreg.alignment.closest_point import TRIM, closest_point
-from torchreg.alignment.softassign import MODEL_OUTLIER, softassign
-from torchreg.geometry.budget import Budget
+from torchreg.alignment.closest_point import closest_point
+from torchreg.alignment.softassign import softassign
 from torchreg.solvers import e_step
-from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
+from torchreg.solvers.e_step import expectation
 
 D = torch.float64
+TRIM, MODEL_OUTLIER, OUTLIER_CONSTANT = 1.5, 0.01, 3 * math.sqrt(math.pi / 2)
 FIELDS = ("weights", "targets", "inlier_posterior", "squared_error")
 EXACT = {"sweeps": 20_000, "tolerance": 1e-13}
 
@@ -181,7 +182,7 @@ def test_closest_points_are_the_limit_of_the_e_step():
 def test_memory_does_not_change_the_answer(monkeypatch, entries):
     model, data, sigma = cloud(3, 6), cloud(3, 9, seed=1), torch.tensor([0.1, 0.2, 0.4], dtype=D)
     at_once = closest_point(model, data, sigma, mask=some_mask(3, 9))
-    monkeypatch.setattr(e_step, "BUDGET", Budget(table_entries=entries))
+    monkeypatch.setattr(e_step, "BUDGET", replace(e_step.BUDGET, table_entries=entries))
     assert_same(closest_point(model, data, sigma, mask=some_mask(3, 9)), at_once)
 
 

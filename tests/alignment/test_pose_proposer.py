@@ -10,7 +10,6 @@ import torchreg.alignment.find_pose as find_pose_module
 from torchreg.alignment import train_initializer as train_module
 from torchreg.alignment.pose_proposer import HAND_WEIGHTS
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
-from torchreg.shapes.pose_algebra import shifted
 
 TINY = tr.ProposerSize(tokens=16, neighbors=4, width=16, heads=2, encoder=1, decoder=1, hypotheses=2, waves=2)
 
@@ -56,17 +55,6 @@ def test_a_hand_as_large_as_a_house_is_found_by_the_same_network(plain_hand, clo
     torch.testing.assert_close(found.poses[..., :3], 50 * small.poses[..., :3], atol=1e-2, rtol=0)
 
 
-def test_dense_clouds_are_as_good_as_those_that_it_was_trained_with(plain_hand):
-    net, skin = tr.PoseInitializer(plain_hand).proposer, tr.sample_skin(plain_hand, 2500)
-    errors = []
-    for count in (400, 1000):
-        generator = torch.Generator().manual_seed(6)
-        drawn = random_clouds(skin, 0.26, random_poses(plain_hand, 16, generator), count, generator)
-        found = plain_hand.keypoints(net.propose(drawn.points, drawn.mask).poses[:, 0])
-        errors.append((found - plain_hand.keypoints(drawn.poses)).norm(dim=-1).mean(-1).median())
-    assert errors[1] < 1.3 * errors[0]
-
-
 def test_only_what_is_doubtful_is_searched_for(plain_hand, plain_hand_skin, clouds, monkeypatch):
     searched = []
 
@@ -95,7 +83,9 @@ def test_a_cloud_gives_alone_what_it_gives_in_a_batch_and_moved(plain_hand, plai
     offset = torch.tensor([0.5, -1.0, 2.0])
     together = net.propose(clouds.points, clouds.mask)
     alone = net.propose(clouds.points[3:4] + offset, clouds.mask[3:4])
-    torch.testing.assert_close(alone.poses, shifted(together.poses[3:4], offset), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        alone.poses, together.poses[3:4] + torch.nn.functional.pad(offset, (0, 24)), atol=1e-3, rtol=0
+    )
     torch.testing.assert_close(together.weights.sum(-1), torch.ones(12))
 
 

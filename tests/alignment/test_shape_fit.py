@@ -7,6 +7,8 @@ import pytest
 import torch
 
 import torchreg as tr
+from torchreg.alignment.person_search import limb_restarts
+from torchreg.alignment.shape_fit import _problem
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
@@ -203,6 +205,29 @@ def test_a_person_who_stands_is_sought_standing(shape):
     assert float(off.mean()) < 0.02
     upside_down = tr.align(shape, data, fit_shape=True, config=replace(QUICK, upright=(-1, 0, 0)))
     assert float(upside_down.confidence) < float(result.confidence)
+
+
+def test_a_limb_on_the_data_of_another_is_swung_onto_its_own(shape):
+    coefficients = torch.zeros(3)
+    pose, data = scan(shape, coefficients, seed=3, one_sided=False, count=800)
+    names = list(shape.dof_names)
+    arm = [names.index(f"{shape.part_names[2]}_{axis}") for axis in "xyz"]
+    problem, state = _problem(
+        shape, data[None], torch.ones(1, len(data), dtype=torch.bool), pose[None], None, config=QUICK,
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    problem, right = problem.rows(torch.zeros(1, dtype=torch.int64)), state[0].clone()
+    right[shape.num_dofs :] = 0
+    right[:3] = pose[:3] - problem.origin[0]
+    wrong = right.clone()
+    wrong[arm] += torch.tensor([0.3, 1.2, 0.0])
+    swung = limb_restarts(problem, wrong, 3, torch.Generator().manual_seed(0))
+    assert len(swung) == 3
+    points = problem.skin(torch.stack([right, wrong, swung[0]]))
+    apart = (points - points[0]).square().sum(-1).mean(-1).sqrt()
+    assert float(apart[2]) < 0.5 * float(apart[1])
+    kept = [dof for dof in range(len(wrong)) if dof not in arm]
+    torch.testing.assert_close(swung[0, kept], wrong[kept])
 
 
 def test_a_person_in_what_is_none_is_doubtful(shape):
