@@ -200,3 +200,27 @@ def test_covariance_of_linear_problems_is_exact():
     )
     for row, alone in zip(both, (jacobian, other), strict=True):
         torch.testing.assert_close(row, pose_covariance(alone, weights, noise, precision + 1))
+
+
+def test_noise_stays_within_a_range_of_the_size(skin, truths):
+    """Without inliers the noise is the largest that a fit uses; exact data do not make the kernel vanish."""
+    size = make_problem(skin, skin(truths)).size
+    lost = make_problem(skin, skin(truths) + 10.0)
+    torch.testing.assert_close(residual_noise(lost, truths), torch.full((3,), 0.02 * size / 2.5).double())
+    exact = on_surface(skin.shape, truths[0])[0].unsqueeze(0)
+    found = residual_noise(make_problem(skin, exact), truths[:1])
+    torch.testing.assert_close(found, torch.full((1,), 0.003 * size / 2.5).double())
+
+
+def test_a_prior_weighs_more_where_more_model_points_share_a_datum(skin, truths):
+    """With every model point twice, twice as many share a datum under a wide kernel: joints stay nearer to the mean."""
+    precision = torch.zeros(DOFS).double()
+    precision[6:] = 2.0
+    start, once = nudged(skin, truths, 0.1), tr.SigmaSchedule.constant(0.03, 1)
+    doubled = tr.LinearBlendSkin(skin.shape, skin.points.repeat(2, 1), skin.weights.repeat(2, 1), skin.reference_pose)
+    problem = make_problem(skin, skin(truths), prior=GaussianPosePrior(start, precision))
+    plain, twice = (
+        (anneal(replace(problem, skin=each), start, once, em_steps=3, m_steps=1).pose - start)[:, 6:].abs().sum()
+        for each in (skin, doubled)
+    )
+    assert float(twice) < 0.95 * float(plain)

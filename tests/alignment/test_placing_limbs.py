@@ -8,7 +8,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import TIPS, generator, hinge, joint, off, problem_of, shape_of, solid
-from torchreg.alignment.limb_search import Effort, LimbSearch
+from torchreg.alignment.limb_search import Effort, LimbSearch, distinct_first
 
 THOROUGH = Effort(
     num_data=400, width=0.05, beam=80, configurations=30, refine_widths=(0.04, 0.03, 0.025), score_width=0.02,
@@ -241,3 +241,12 @@ def test_a_shape_without_joints_is_left_as_it_is():
 
 
 # Parts
+
+
+def test_what_is_close_to_something_better_comes_last():
+    values = torch.tensor([[0.0, 0.1, 0.15, 1.0, 0.25, 1.05]])
+    close = (values.unsqueeze(2) - values.unsqueeze(1)).abs() < 0.2
+    # 0.25 is close to 0.1 and 0.15 only, which are not kept themselves.
+    assert distinct_first(close).tolist() == [[0, 3, 4, 1, 2, 5]]
+    assert distinct_first(torch.eye(4, dtype=torch.bool).unsqueeze(0)).tolist() == [[0, 1, 2, 3]]
+    assert distinct_first(torch.ones(1, 3, 3, dtype=torch.bool)).tolist() == [[0, 1, 2]]
