@@ -54,18 +54,12 @@ _AROUND = _Around()
 
 
 def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
-    """Return a mask (B,) of problems with which a single descent cannot be trusted.
-
-    Either it went far from its start, where other minima are as near; or it leaves an unexplained cluster of data.
-    """
+    """Return a mask (B,) of problems whose descent went far from its start or leaves an unexplained cluster of data."""
     return (_motion(start, pose) > _TRUST.motion) | leaves_clusters(problem, pose)
 
 
 def _motion(start: Tensor, pose: Tensor) -> Tensor:
-    """Return the motion (B,) between poses, radians: of the base or the joints, the larger.
-
-    That of the joints is their root mean square, or half the largest.
-    """
+    """Return the motion (B,) between poses, radians: of the base, or the joints' RMS or half their largest."""
     step = difference(start, pose)
     joints = pad(step[:, BASE_DOFS:].abs(), (0, 1))
     moved = torch.maximum(joints.square().mean(-1).sqrt(), 0.5 * joints.amax(-1))
@@ -73,30 +67,9 @@ def _motion(start: Tensor, pose: Tensor) -> Tensor:
 
 
 def explore(
-    problem: AlignProblem,
-    start: Tensor,
-    descended: Tensor,
-    *,
-    candidates: int,
-    rounds: int,
-    generator: torch.Generator,
+    problem: AlignProblem, start: Tensor, descended: Tensor, *, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
-    """Return the best poses found around the starts; the problems of a batch are searched together.
-
-    Limbs are placed anew from the descended pose. Where that shows that it was in a wrong minimum, candidates are
-    scattered around the start and the best pose so far, and go through `PoseSearch` in one batch.
-
-    Args:
-        problem: the batch.
-        start: (B, num_dofs).
-        descended: (B, num_dofs) result of a single descent from each start.
-        candidates: per problem.
-        rounds: of the thorough search, at most.
-        generator: of the scatter and of the subset of the data.
-
-    Returns:
-        (B, num_dofs).
-    """
+    """Return the best poses (B, num_dofs) of limbs placed anew and, where those differ, of scattered candidates."""
     per_problem = candidates * _AROUND.data_per_candidate * problem.skin.shape.num_parts
     rows = torch.arange(len(start), device=start.device).split(max(1, _AROUND.entries // per_problem))
     state, found = generator.get_state(), []
@@ -150,7 +123,7 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     shape = problem.skin.shape
     scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
-    scale = problem.at_most_told(scale).unsqueeze(1)
+    scale = problem.cap_std_by_prior(scale).unsqueeze(1)
     noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
     around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)
