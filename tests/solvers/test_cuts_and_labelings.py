@@ -240,3 +240,11 @@ def test_a_seam_runs_where_labels_agree():
         places[:, 1, 0] = 0.1 + 0.1 * (torch.arange(8) - agree).abs()
         labels = alpha_expansion(unary, edges, torch.full((8,), 0.01), positions=places).labels
         assert labels.tolist() == [0] * (agree + 1) + [1] * (8 - agree)
+
+
+def test_huge_terminals_beside_tiny_edges_keep_the_resolution_of_the_edges():
+    edges, generator = random_graph(3, 8, 14)
+    source, sink = torch.rand(2, 8, generator=generator, dtype=torch.float64)
+    source[0], sink[1] = 1e15, 1e15
+    capacities = torch.rand(len(edges), generator=generator, dtype=torch.float64)
+    assert cut(source, sink, edges, capacities, capacities).error < 1e-6

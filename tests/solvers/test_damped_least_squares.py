@@ -333,3 +333,16 @@ def test_the_damped_step_is_marquardts():
     reduced = -torch.linalg.solve((hessian + diagonal)[:, keep][:, :, keep], gradient[:, keep])
     assert held[:, 1].tolist() == [0, 0]
     torch.testing.assert_close(held[:, keep], reduced, rtol=1e-8, atol=0)
+
+
+def test_a_rejected_step_keeps_the_state_and_raises_the_damping():
+    def linearize(state):
+        # The gradient points the wrong way: every step raises the cost.
+        return Linearization(0.5 * state.square().sum(-1), -state, torch.eye(2, dtype=D).expand(1, 2, 2))
+
+    start = torch.ones(1, 2, dtype=D)
+    result = levenberg_marquardt(linearize, start, max_steps=4)
+    assert torch.equal(result.state, start)
+    assert result.last_step.tolist() == [[0, 0]]
+    assert float(result.damping) == pytest.approx(1e-3 * 6**4)
+    assert float(levenberg_marquardt(linearize, start, max_steps=40).damping) == 1e7
