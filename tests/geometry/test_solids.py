@@ -105,20 +105,12 @@ def test_the_ellipsoid_distance_is_euclidean_to_first_order(radii):
 # --- capsules and cones ---
 
 
-@pytest.mark.parametrize("sizes", SIZES["capsule"])
-def test_the_capsule_distance_is_exact(sizes):
-    points = random_points(400, sizes, spread=2.5)
-    expected = profile_distance(points.numpy(), capsule_outline(*sizes))
-    np.testing.assert_allclose(
-        PRIMITIVE_KINDS["capsule"].distance(points, row(sizes)), expected, atol=1e-6 * max(sizes)
-    )
-
-
-@pytest.mark.parametrize("sizes", SIZES["cone"])
-def test_the_cone_distance_is_exact(sizes):
-    points = random_points(2000, sizes, spread=2.5)
-    expected = profile_distance(points.numpy(), cone_outline(*sizes))
-    np.testing.assert_allclose(PRIMITIVE_KINDS["cone"].distance(points, row(sizes)), expected, atol=1e-15)
+@pytest.mark.parametrize(("kind", "sizes"), [case for case in CASES if case[0] in ("capsule", "cone")])
+def test_distances_to_capsules_and_cones_are_exact(kind, sizes):
+    points = random_points(2000 if kind == "cone" else 400, sizes, spread=2.5)
+    outline, tolerance = (cone_outline, 1e-15) if kind == "cone" else (capsule_outline, 1e-6 * max(sizes))
+    expected = profile_distance(points.numpy(), outline(*sizes))
+    np.testing.assert_allclose(PRIMITIVE_KINDS[kind].distance(points, row(sizes)), expected, atol=tolerance)
 
 
 def test_the_rim_of_a_cone_is_finite():
