@@ -11,6 +11,7 @@ from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.fusion import fuse_motions
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.problem import ExpectedPlaces, describe
+from torchreg.registration.dense.reliability import scan_evidence
 from torchreg.registration.dense.stages import judge
 
 
@@ -92,3 +93,15 @@ def test_alignments_of_one_thing_are_trusted_and_of_two_are_not(pair, aligned, s
     assert 0.7 < aligned.confidence < 1
     lifted = pair.target.shifted(torch.tensor([0.0, 0.0, 0.1]) * pair.source.diagonal)
     assert align_scans(pair.source, lifted, quick).confidence == pytest.approx(aligned.confidence, abs=0.2)
+
+
+def test_evidence_is_what_is_judged_of_visible_points_and_their_support(problem, quick):
+    motions, prior = problem.graph.rest(), problem.prior
+    motions[:, 0, 3] += 0.02
+    judged, found = judge(problem, "some", motions), scan_evidence(problem, motions, 0.3)
+    assert found.forward == pytest.approx(judged.forward / float(prior.visible[:400].mean()))
+    assert found.backward == pytest.approx(judged.backward / float(prior.target_visible.mean()))
+    nearest = torch.cdist(problem.moved(motions).points, problem.target.points).argmin(1)
+    support = prior.logarithm(nearest[:, None], quick.doubt)[:, 0]
+    assert found.unsupported == pytest.approx(-float((prior.visible * support).sum() / prior.visible.sum()))
+    assert (found.hidden, found.smoothness) == (pytest.approx(1 - float(prior.visible.mean())), 0.3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -113,6 +113,12 @@ class BoneProblem:
     anchors: Tensor | None = None
     anchor_weights: float | Tensor = 0.0
     blend: str = "linear"
+
+    @classmethod
+    def of_weights(cls, points: Tensor, weights: Tensor, correspondences: Correspondences, **terms: Any) -> BoneProblem:
+        """Return the problem of bones that have weights (N, B) at the points; the other terms by name."""
+        binding, bodies = Binding.from_weights(weights), BoneBodies.from_weights(points, weights)
+        return cls(points=points, binding=binding, correspondences=correspondences, bodies=bodies, **terms)
 
     def energy(self, transforms: Tensor) -> Tensor:
         """Return E (...) at motions (..., B, 4, 4). Cost: that of `linearize`."""
