@@ -67,25 +67,10 @@ def align_scans(
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
 
-    Args:
-        source: the scan to be moved, N points.
-        target: the scan to be reached, M points, in the same frame and unit.
-        config: see `ScanAlignConfig`.
-        generator: source of randomness; None draws the same numbers at every call.
-        on_step: called with a `ScanAlignRecord` for each step, by the calling thread; when a hypothesis that another
-            thread follows is done, for all of its steps.
-        expected: where the source's points (N, 3) are expected, such as by their velocity, and how surely.
-
-    Returns:
-        a `ScanAlignment`.
-
-    Raises:
-        InputError: if ``expected`` is not finite, its std is negative, or its shape does not fit.
-
-    Differentiable: no.
-
-    Cost: 0.7 to 1.5 s for scans of 8,000 points on one core; three quarters where torch may use two threads, which
-    then follow two hypotheses side by side: the result is the same to the bit.
+    ``target``: the scan to be reached, M points, in the same frame and unit. ``generator``: source of randomness; None
+    draws the same numbers at every call. ``on_step``: called with a `ScanAlignRecord` for each step, by the calling
+    thread; when a hypothesis that another thread follows is done, for all of its steps. ``expected``: where the
+    source's points (N, 3) are expected, such as by their velocity, and how surely.
 
     References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
     Myronenko and Song 2010 for the EM with outliers.

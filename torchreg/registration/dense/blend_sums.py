@@ -45,9 +45,6 @@ class BlendSums:
         weights: (R, K) by how much; of any sign, zero for none.
         num_nodes: J.
 
-    Raises:
-        InputError: if a shape does not fit or a node does not exist.
-
     References: Sumner, Schmid and Pauly 2007, section 4.
     """
 
@@ -86,12 +83,6 @@ class BlendSums:
         """Return the gradient (J, 6) and the Hessian (6 J, 6 J), of which the lower triangle alone is filled.
 
         Convention: twists are (translation, rotation), about the middles; see `turn_about`.
-
-        Args:
-            transforms: (J, 4, 4).
-            middles: (J, 3) about which nodes turn.
-            metrics: (R, 6) upper triangles of P_i.
-            pulls: (R, 3) P_i d_i.
         """
         arms = transforms.clone()
         arms[:, :3, 3] -= middles

@@ -50,9 +50,6 @@ class ScanAlignConfig:
         doubt: support of a match that the matcher calls impossible, beside one of a sure match.
         cap: distances from the target count up to this in the choice among the hypotheses, length.
         smoothness: what it costs there that neighboring nodes disagree by one size in the mean.
-
-    Raises:
-        InputError: if a value is out of range.
     """
 
     num_samples: int = 1200

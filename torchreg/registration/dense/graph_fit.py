@@ -76,20 +76,8 @@ def fit_graph(
     the edge's two gaps: parts stay rigid, and what they do not share, joints take up. No step shifts a node by more
     than the diagonal of the samples or the largest residual.
 
-    Args:
-        graph: what is moved, float64 on the CPU.
-        transforms: (J, 4, 4) to start from.
-        matches: see `GraphMatches`.
-        stiffness: see above.
-        num_steps: linear systems, at least one, none of them tested: the caller finds new matches before long.
-        edge_scale: see above, in the unit of the points; None for edges that are never let go.
-
-    Returns:
-        a `GraphFit`.
-
-    Differentiable: no.
-
-    Cost: 2 ms a step for 1,200 samples on 4 of 60 nodes each, on one core, half of it for the linear system.
+    ``num_steps``: linear systems, at least one, none of them tested: the caller finds new matches before long.
+    ``edge_scale``: see above, in the unit of the points; None for edges that are never let go.
 
     References: Sumner, Schmid and Pauly 2007, section 4; Chang and Zwicker 2009, eq. 5, for the steps on twists.
     """

@@ -72,17 +72,7 @@ def describe(
     generator: torch.Generator | None = None,
     expected: ExpectedPlaces | None = None,
 ) -> ScanAlignProblem:
-    """Return the problem of aligning two scans.
-
-    Args:
-        source: the scan to be moved.
-        target: the scan to be reached.
-        config: see `ScanAlignConfig`.
-        generator: source of the samples' randomness.
-        expected: where the source's points are expected.
-
-    Cost: 0.3 s for scans of 8,000 points.
-    """
+    """Return the problem of aligning two scans."""
     here, there = (scan.uniform_subsample(2 * config.num_samples, generator=generator) for scan in (source, target))
     here, there = here[even_order(source.points[here])], there[even_order(target.points[there])]
     unit = Normalization.from_points(source.points[here])

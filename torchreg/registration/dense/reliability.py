@@ -67,13 +67,7 @@ def confidence_onward(before: float, confidence: float) -> float:
 
 
 def scan_evidence(problem: ScanAlignProblem, transforms: Tensor, smoothness: float) -> ScanEvidence:
-    """Return the evidence against motions (J, 4, 4) of the nodes.
-
-    Args:
-        problem: the scans.
-        transforms: the motions.
-        smoothness: of the graph, see `Hypothesis`.
-    """
+    """Return the evidence against motions (J, 4, 4) of the nodes."""
     moved, prior = problem.moved(transforms), problem.prior
     cost, index = mismatch(problem, moved)
     support = prior.logarithm(index[:, None], problem.config.doubt)[:, 0]
