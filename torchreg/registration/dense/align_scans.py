@@ -126,13 +126,13 @@ def align_problem(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]
 
 
 def evidence_against(problem: ScanAlignProblem, best: Candidate) -> ScanEvidence:
-    """Return what speaks against a candidate."""
+    """Return the evidence vector of a candidate."""
     return scan_evidence(problem, best.transforms, best.hypothesis.smoothness)
 
 
 def _candidates(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     """Return the candidates before any are fused."""
-    near, matched = _both_told(on_step, partial(_near, problem), partial(_by_matches, problem))
+    near, matched = _run_both_reporting(on_step, partial(_near, problem), partial(_by_matches, problem))
     return [*near, matched]
 
 
@@ -141,8 +141,8 @@ def _near(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     rest = problem.graph.rest()
     found = [_compared(problem, rest, Reporter("rest", problem.unit.scale, on_step))]
     if problem.expected is not None:
-        there = GraphMatches.of_places(problem.expected.places)
-        ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
+        expected = GraphMatches.of_places(problem.expected.places)
+        ahead = fit_graph(problem.graph, rest, expected, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
         found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step)))
     return found
 
@@ -153,7 +153,7 @@ def _by_matches(problem: ScanAlignProblem, on_step: OnStep) -> Candidate:
     return _compared(problem, fit_coarsely(problem, reporter), reporter)
 
 
-def _both_told(
+def _run_both_reporting(
     on_step: OnStep, one: Callable[[OnStep], _One], other: Callable[[OnStep], _Other]
 ) -> tuple[_One, _Other]:
     """Return what two calls return, made side by side; the thread that called the library tells of their steps."""

@@ -1,4 +1,4 @@
-"""How far an alignment of two scans can be trusted: what speaks against it, and a learnt probability."""
+"""How far an alignment of two scans can be trusted: evidence against it, and a learnt probability."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchreg.registration.dense.stages import mismatch, uncovered
 
 @dataclass(frozen=True)
 class ScanEvidence:
-    """What speaks against an alignment.
+    """Evidence against an alignment.
 
     Args:
         forward: mean cost of moved samples that the matcher calls visible, see `mismatch`.
