@@ -7,7 +7,7 @@ import torch
 
 import torchreg as tr
 from torchreg.capture.free_space import FreeSpace
-from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.geometry.rigid import se3_exp
 from torchreg.io.calibration import save_depth_camera
 from torchreg.io.images import save_depth, save_image
 
@@ -90,7 +90,7 @@ def test_nothing_is_known_behind_the_camera_and_in_holes():
     depth, mask = wall_with_box()
     depth[20, 30] = 0.0
     space = tr.DepthFrame(depth, CAMERA, mask).free_space
-    behind = transform_points(torch.linalg.inv(MOTION), depth.new_tensor([[0.0, 0.0, -1.0]]))
+    behind = torch.linalg.solve(MOTION, depth.new_tensor([0.0, 0.0, -1.0, 1.0]))[None, :3]
     points = torch.cat([behind, at_pixels(CAMERA, [30.0], [20.0], [0.5])])
     assert space.intrusion(points[None]).tolist() == [[0.0, 0.0]]
 
