@@ -18,10 +18,10 @@ from torchreg.alignment.align_stages import (
     DataOnShape,
     anneal_batch,
     best_start,
+    continue_unconverged,
     fit_batch_surface,
-    fit_to_the_end,
-    keep_searched,
-    refit_without_cut,
+    prefer_start_fit,
+    refit_uncropped,
     search_where_needed,
 )
 from torchreg.alignment.annealed_em import OnStep, StageResult
@@ -41,13 +41,7 @@ from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.observability import dof_confidence
 from torchreg.alignment.person_gradient import person_with_gradients
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.problem import (
-    AlignProblem,
-    alignment_cost,
-    centered_problem,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
 from torchreg.alignment.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
@@ -166,7 +160,7 @@ def align(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
                 keypoint_std=keypoint_std, fit_shape=fit_shape, initializer=initializer, config=config, on_step=on_step,
             ),
-            partial(source.glance, skin),
+            partial(source.crop_score, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
@@ -196,7 +190,7 @@ def _align(
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
-    """Return the alignment to what was seen not far from the origin of coordinates."""
+    """Return the alignment to data near the origin."""
     lead, seen = None, seen.drawn(shape, config.nan_policy, config.seed)
     if initial_pose is None and known is not None and known.places_base:
         initial_pose = known.start(shape)
@@ -210,28 +204,24 @@ def _align(
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
         batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen)
         if known is not None:
-            batch = replace(batch, problem=known.applied(batch.problem, batch.start))
+            batch = replace(batch, problem=known.with_prior(batch.problem, batch.start))
         warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
         warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=3)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
             found = anneal_batch(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
             found = fit_batch_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
             batch, found = best_start(batch, found) if several else (batch, found)
-            found = found if lead is None else keep_searched(batch, found, config)
+            found = found if lead is None else prefer_start_fit(batch, found, config)
             found = search_where_needed(batch, found, config)
-            judged = without_cut(batch.problem, found.pose, seen.frames)
-            found = refit_without_cut(batch, judged, found, config)
-            found = fit_to_the_end(batch, judged, found, config)
-        result = _result(batch, found, config, lead, judged, seen)  # inliers by eq. 2, the posterior by eq. 17
+            uncropped = without_cut(batch.problem, found.pose, seen.frames)
+            found = refit_uncropped(batch, uncropped, found, config)
+            found = continue_unconverged(batch, uncropped, found, config)
+        result = _result(batch, found, config, lead, uncropped, seen)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
 def _align_person(
-    shape: ArticulatedShape,
-    seen: Observation,
-    initial_pose: Tensor | None,
-    config: AlignConfig,
-    on_step: OnStep | None,
+    shape: ArticulatedShape, seen: Observation, initial_pose: Tensor | None, config: AlignConfig, on_step: OnStep | None
 ) -> AlignResult:
     """Return the alignment of a rig whose coefficients are fitted together with its pose."""
     origin = floating_origin(shape, seen.points)
@@ -380,7 +370,7 @@ def _result(
     found: StageResult,
     config: AlignConfig,
     lead: Tensor | None,
-    judged: AlignProblem,
+    uncropped: AlignProblem,
     seen: Observation,
     error: SurfaceError | None = None,
 ) -> AlignResult:
@@ -393,7 +383,7 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    judgement = judge(judged, pose, lead, error, seen.frames)
+    judgement = judge(uncropped, pose, lead, error, seen.frames)
     confidence = torch.where(degenerate, 0.0, judgement.confidence)
     converged = found.change <= config.pose_atol
     converged = converged | judgement.converged if config.surface_steps or error is not None else converged

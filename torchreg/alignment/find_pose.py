@@ -27,12 +27,7 @@ from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
-from torchreg.alignment.problem import (
-    AlignProblem,
-    centered_problem,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
@@ -169,7 +164,7 @@ def find_pose(
             find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
             locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.glance, skin))[0]
+        return surest_crop(data, model_size(skin), search, partial(source.crop_score, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
@@ -189,7 +184,7 @@ def search_everywhere(
     config: FindPoseConfig,
     known: KnownDofs | None = None,
 ) -> FoundStarts:
-    """Return what `find_pose` finds in what was seen, not far from the origin."""
+    """Return what `find_pose` finds in data near the origin."""
     seen = seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
     with torch.no_grad():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
@@ -203,12 +198,12 @@ def search_everywhere(
             free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
-            problem = known.applied(problem, shifted(known.start(shape).expand_as(typical), -origin))
+            problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
         warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
-            poses, costs = _find(problem, seen.frames, source.informed(known), config)
+            poses, costs = _find(problem, seen.frames, source.with_known(known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
@@ -221,12 +216,7 @@ def search_everywhere(
 
 @dataclass(frozen=True, eq=False)
 class FoundStarts:
-    """Starts, and by how much the first is better than others.
-
-    Args:
-        starts: best first.
-        lead: (B,) cost by which the best of different poses is worse than the first; infinite where there is none.
-    """
+    """Starts, best first, and the cost (B,) by which the best of different poses is worse, or infinity."""
 
     starts: PoseStarts
     lead: Tensor
@@ -235,16 +225,13 @@ class FoundStarts:
 def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
 ) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs), best first, and their costs: a network's, and those of a search if doubtful.
-
-    The search is of no use where all that is doubtful is where limbs end that no data show.
-    """
+    """Return candidates (B, H, num_dofs), best first, and costs: a network's, and a search's if in doubt."""
     problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
     poses, costs = fit_rows(problem, proposed)
-    judged = without_cut(problem, poses[:, 0], frames)
-    sure = explains(judged, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
+    uncropped = without_cut(problem, poses[:, 0], frames)
+    sure = explains(uncropped, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     first = torch.zeros(len(poses), min(config.num_searched, config.num_placed), dtype=torch.int64, device=poses.device)
@@ -276,14 +263,7 @@ def _search_with_retries(
 def _search(
     problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs) after one search, best first, and their costs.
-
-    Args:
-        problem: the batch.
-        source: of rough poses.
-        config: of the search.
-        proposed: (B, K, num_dofs) that lie on the data already.
-    """
+    """Return candidates (B, H, num_dofs) after one search, best first, and their costs."""
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = source.rough(search.problem, generator)

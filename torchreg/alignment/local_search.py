@@ -72,10 +72,7 @@ def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
 
 
 def _motion(start: Tensor, pose: Tensor) -> Tensor:
-    """Return the motion (B,) between poses, radians: of the base or the joints, the larger.
-
-    That of the joints is their root mean square, or half the largest.
-    """
+    """Return the motion (B,) between poses, radians: of the base, or the joints' RMS or half their largest."""
     step = difference(start, pose)
     joints = pad(step[:, BASE_DOFS:].abs(), (0, 1))
     moved = torch.maximum(joints.square().mean(-1).sqrt(), 0.5 * joints.amax(-1))
@@ -83,13 +80,7 @@ def _motion(start: Tensor, pose: Tensor) -> Tensor:
 
 
 def explore(
-    problem: AlignProblem,
-    start: Tensor,
-    descended: Tensor,
-    *,
-    candidates: int,
-    rounds: int,
-    generator: torch.Generator,
+    problem: AlignProblem, start: Tensor, descended: Tensor, *, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
     """Return the best poses found around the starts; the problems of a batch are searched together.
 
@@ -175,7 +166,7 @@ def _scatter(
     shape = problem.skin.shape
     scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
-    scale = problem.at_most_told(scale).unsqueeze(1)
+    scale = problem.cap_std_by_prior(scale).unsqueeze(1)
     noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
     around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)

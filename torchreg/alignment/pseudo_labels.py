@@ -26,26 +26,9 @@ def label_frames(
     trusted: float = 0.5,
     start: Tensor | None = None,
 ) -> Iterator[PoseLabel]:
-    """Yield a label for each frame of a motion.
+    """Yield a `PoseLabel` for each frame of a motion, a cloud (M, 3) in metres or a depth frame, from the frame before.
 
-    A frame starts from the pose of the frame before. Where the confidence in that pose, or in the one it leads to, is
-    too low, the pose is searched for from scratch, and the one of higher confidence is kept.
-
-    Args:
-        initializer: of the shape.
-        frames: clouds (M, 3), metres; or depth frames, which are aligned with their free space, and labeled in the crop
-            that shows the shape.
-        trusted: least confidence in a pose that the next frame starts from.
-        start: (num_dofs,) of the first frame, if known.
-
-    Yields:
-        a `PoseLabel` per frame, in the coordinates of the clouds; in float64 where those of the first are far from the
-        origin.
-
-    Raises:
-        InputError: if ``trusted`` is negative or a cloud is empty or not finite.
-
-    Differentiable: no.
+    Where the confidence is below ``trusted`` the pose is searched from scratch, and the more confident one is kept.
     """
     check_positive(trusted, "trusted", allow_zero=True)
     origin, is_first = None, True

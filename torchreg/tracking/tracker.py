@@ -271,7 +271,7 @@ class Tracker:
     def _met(self, person: PersonFilter, state: TrackState, frame: Frame) -> TrackState:
         """Return the state with the person whom a frame shows, who is followed from now on; itself without one."""
         start = state.pose if state.found else None
-        met = person.met(frame.data if frame.picture is None else frame.picture, start)
+        met = person.initialize(frame.data if frame.picture is None else frame.picture, start)
         if met is None:
             return state
         pose, known = met
@@ -453,5 +453,5 @@ def _learned(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFi
         return state
     known = KnownPerson(state.coefficients, state.coefficient_covariance)
     viewpoint = None if frame.picture is None else frame.picture.camera.position - fit.view.origin
-    known = person.learned(known, fit.view.problem.data[0], fit.pose[0], viewpoint)
+    known = person.update(known, fit.view.problem.data[0], fit.pose[0], viewpoint)
     return replace(state, coefficients=known.coefficients, coefficient_covariance=known.covariance)
