@@ -49,6 +49,7 @@ from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.far_origin import to_local, to_world
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -165,19 +166,20 @@ def align(
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
+    origin = floating_origin(shape, seen.points)
+    seen, known = to_local(seen, origin), to_local(known, origin)
+    start = initial_pose if origin is None or initial_pose is None else to_local(torch.as_tensor(initial_pose), origin)
+    on_local_step = on_step if origin is None or on_step is None else partial(_in_world, on_step, origin)
     if fit_shape is not False:
         if initializer is not None:
             raise InputError("initializer has no meaning with fit_shape; people are sought without one")
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
-        found = _align_person(shape, seen, initial_pose, config, on_step)
-        person = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
-        return replace(found, shape=person)
-    origin = floating_origin(shape, seen.points)
-    if origin is not None:
-        found = _align_about(origin, shape, seen, initial_pose, model_points, known, source, config, on_step)
+        found = _align_person(shape, seen, start, config, on_local_step)
+        shape = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
     else:
-        found = _align(shape, seen, initial_pose, model_points, known, source, config, on_step)
-    return replace(found, shape=shape)
+        points = to_local(model_points, origin) if isinstance(model_points, Tensor) else model_points
+        found = _align(shape, seen, start, points, known, source, config, on_local_step)
+    return replace(to_world(found, origin), shape=shape)
 
 
 def _align(
@@ -224,11 +226,6 @@ def _align_person(
     shape: ArticulatedShape, seen: Observation, initial_pose: Tensor | None, config: AlignConfig, on_step: OnStep | None
 ) -> AlignResult:
     """Return the alignment of a rig whose coefficients are fitted together with its pose."""
-    origin = floating_origin(shape, seen.points)
-    if origin is not None:
-        start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
-        told = None if on_step is None else partial(_tell_moved, on_step, origin)
-        return _align_person(shape, seen.near(origin), start, config, told).moved(origin)
     by_data = torch.is_grad_enabled() and isinstance(seen.points, Tensor) and seen.points.requires_grad
     seen = seen if by_data else seen.drawn(shape, config.nan_policy, config.seed)
     with torch.inference_mode():
@@ -274,28 +271,9 @@ class _History:
             self._on_step(step)
 
 
-def _align_about(
-    origin: Tensor,
-    shape: ArticulatedShape,
-    seen: Observation,
-    initial_pose: Tensor | None,
-    model_points: Tensor | LinearBlendSkin | None,
-    known: KnownDofs | None,
-    source: StartSource,
-    config: AlignConfig,
-    on_step: OnStep | None,
-) -> AlignResult:
-    """Return the alignment to data far from the origin of coordinates, computed about an origin (3,) near them."""
-    told = None if on_step is None else partial(_tell_moved, on_step, origin)
-    start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
-    points = model_points - origin if isinstance(model_points, Tensor) else model_points
-    known = None if known is None else known.near(origin)
-    return _align(shape, seen.near(origin), start, points, known, source, config, told).moved(origin)
-
-
-def _tell_moved(on_step: OnStep, origin: Tensor, step: AlignRecord) -> None:
-    """Pass a record on in coordinates that begin where an origin (3,) is given."""
-    on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
+def _in_world(on_step: OnStep, origin: Tensor | None, step: AlignRecord) -> None:
+    """Pass a record on whose coordinates begin at an origin (3,)."""
+    on_step(replace(step, pose=to_world(step.pose, origin)))
 
 
 def _found_pose(

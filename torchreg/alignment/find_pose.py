@@ -35,6 +35,7 @@ from torchreg.alignment.start_source import StartSource
 from torchreg.alignment.whole_alignment import align_rows, best_distinct, best_first, fit_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.far_origin import to_local, to_world
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -166,13 +167,10 @@ def find_pose(
         )  # fmt: skip
         return surest_crop(data, model_size(skin), search, partial(source.crop_score, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
-    far = floating_origin(shape, seen.points)
-    near = seen if far is None else seen.near(far)
-    known = KnownDofs.of(shape, locked, prior)
-    known = known if known is None or far is None else known.near(far)
-    starts = search_everywhere(shape, near, num_starts, source, model_points, config, known).starts
-    poses = starts.poses if far is None else shifted(starts.poses.double(), far.to(starts.poses.device))
-    return replace(starts, poses=poses, shape=shape)
+    origin = floating_origin(shape, seen.points)
+    seen, known = to_local(seen, origin), to_local(KnownDofs.of(shape, locked, prior), origin)
+    starts = search_everywhere(shape, seen, num_starts, source, model_points, config, known).starts
+    return replace(starts, poses=to_world(starts.poses, origin), shape=shape)
 
 
 def search_everywhere(
