@@ -12,9 +12,7 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.alignment.annealed_em import ANNEALING, anneal
 from torchreg.alignment.confidence import explains, is_misfit, pose_confidence
-from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
@@ -26,15 +24,15 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
-from torchreg.alignment.limb_search import distinct_first, rows_in_memory, take_rows
+from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.pose_search import SEARCH_BUDGET, PoseSearch, mean_distances
-from torchreg.alignment.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
+from torchreg.alignment.pose_search import PoseSearch, mean_distances
+from torchreg.alignment.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.start_source import StartSource
-from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.alignment.whole_alignment import align_rows, best_distinct, best_first, fit_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.far_origin import to_local, to_world
@@ -50,8 +48,6 @@ class _Candidates:
     """Numbers of the candidates; lengths are shares of the model's size."""
 
     typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
-    max_compared: int = 300  # best rough poses, of which different ones are taken
-    same_rough: float = 0.045  # rough poses whose points differ by less are duplicates
     same: float = 0.05  # found poses whose points differ by less are duplicates
     fit_steps: int = 3  # at each width of the coarse fit
     proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
@@ -231,7 +227,7 @@ def _find(
     problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
-    poses, costs = _fitted(problem, proposed)
+    poses, costs = fit_rows(problem, proposed)
     uncropped = without_cut(problem, poses[:, 0], frames)
     sure = explains(uncropped, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
@@ -241,7 +237,7 @@ def _find(
     if len(rows):
         found, found_costs = _search_with_retries(problem.rows(rows), source, config, poses[rows])
         searched[rows], searched_costs[rows] = found, found_costs
-    return _best_first(torch.cat([poses, searched], dim=1), torch.cat([costs, searched_costs], dim=1))
+    return best_first(torch.cat([poses, searched], dim=1), torch.cat([costs, searched_costs], dim=1))
 
 
 def _search_with_retries(
@@ -271,48 +267,15 @@ def _search(
     rough = source.rough(search.problem, generator)
     rough, rough_costs = register_rigidly(search.problem, rough, generator)
     if isinstance(problem.surface, SkinSurface):
-        rough = _best_distinct(search.problem, rough, rough_costs, config.num_placed)
-        return _fitted(problem, _registered(problem, torch.cat([proposed, rough], dim=1), config, generator))
-    rough = _best_distinct(search.problem, rough, rough_costs, config.num_candidates)
+        rough = best_distinct(search.problem, rough, rough_costs, config.num_placed)
+        return fit_rows(
+            problem, align_rows(problem, torch.cat([proposed, rough], dim=1), config.num_searched, generator)
+        )
+    rough = best_distinct(search.problem, rough, rough_costs, config.num_candidates)
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
     pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
-    return _fitted(problem, poses)
-
-
-def _registered(problem: AlignProblem, poses: Tensor, config: FindPoseConfig, generator: torch.Generator) -> Tensor:
-    """Return the best candidates (B, H, num_dofs) after an alignment of all joints: limbs of skins are not placed."""
-    settings, found, count = AlignConfig(), [], poses.shape[1]
-    drawn = replace(problem.draw(SEARCH_BUDGET.num_data, generator), debias=settings.debias)
-    schedule, shape = ANNEALING.schedule(problem.size), problem.skin.shape
-    derivatives = count * shape.num_parts * problem.skin.basis.shape[-1] * shape.num_dofs
-    for rows in rows_in_memory(len(poses), derivatives, poses.device):
-        part, pose = drawn.rows(rows).repeated(count), poses[rows].flatten(0, 1)
-        pose = anneal(part, pose, schedule, em_steps=settings.em_steps, m_steps=settings.m_steps).pose
-        pose = fit_surface(part, pose, steps=settings.surface_steps).pose
-        costs = alignment_cost(part, pose).unflatten(0, (-1, count))
-        found.append(_best_distinct(drawn.rows(rows), pose.unflatten(0, (-1, count)), costs, config.num_searched))
-    return torch.cat(found)
-
-
-def _fitted(problem: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, K, num_dofs) fitted to the whole problem, best first, and their costs."""
-    count = poses.shape[1]
-    wide = problem.repeated(count)
-    fitted = fit_surface(wide, poses.flatten(0, 1), steps=SURFACE_FIT.search_steps, widths=SURFACE_FIT.widths[-1:]).pose
-    return _best_first(fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(len(poses), count))
-
-
-def _best_first(poses: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
-    order = costs.argsort(dim=1, stable=True)
-    return take_rows(poses, order), costs.gather(1, order)
-
-
-def _best_distinct(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> Tensor:
-    """Return the best ``count`` of poses (B, K, num_dofs) whose points differ; then duplicates of them."""
-    poses = take_rows(poses, costs.argsort(1)[:, : _CANDIDATES.max_compared])
-    order = distinct_first(mean_distances(problem, poses) < _CANDIDATES.same_rough * problem.size)
-    return take_rows(poses, order[:, :count])
+    return fit_rows(problem, poses)
 
 
 def _lead(problem: AlignProblem, poses: Tensor, costs: Tensor) -> Tensor:
