@@ -55,13 +55,10 @@ _VARIETY = _Variety()
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch:
-    """Clouds of one shape, and the truth.
+    """Clouds (B, M, 3) of one shape about the origin, metres; the mask (B, M) is False for padding; and the truth.
 
     Args:
-        points: (B, M, 3), metres, the shape about the origin.
-        mask: (B, M), False where there is no point.
-        poses: (B, num_dofs).
-        index: (B, M) int64 point of the skin that was seen, -1 for outliers.
+        index: (B, M) int64 observed point of the skin, -1 for outliers.
     """
 
     points: Tensor
@@ -75,14 +72,6 @@ def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator
 
     Fingers of a hand curl together in half of the poses; all other joints move independently, each pose by up to a
     share of their ranges of its own.
-
-    Args:
-        shape: whose base can move.
-        count: of poses.
-        generator: on the device on which to draw.
-
-    Raises:
-        InputError: if the base cannot move.
     """
     check_count(count, "count", 1)
     if not bool(torch.isinf(shape.lower[:3]).all()):
@@ -115,14 +104,8 @@ def random_clouds(
 ) -> CloudBatch:
     """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, thinned or not.
 
-    The thing is not quite of the shape's proportions; a forearm is at some hands, and another thing beside some.
-
-    Args:
-        skin: many points of the surface, with normals.
-        size: of the shape, metres.
-        poses: (B, num_dofs), the shape about the origin.
-        num_points: of each cloud, at most.
-        generator: on the device of the skin.
+    The object's proportions differ a little from the shape's (size in metres); some hands have a forearm, and some
+    clouds a second object.
     """
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)
@@ -152,13 +135,7 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Draw:
-    """Draws what differs between clouds of a batch.
-
-    Args:
-        generator: of all numbers.
-        like: a tensor whose dtype and device the draws have.
-        size: of the shape, metres.
-    """
+    """Draws the differences between clouds of a batch, for a shape of a size in metres, like a tensor."""
 
     generator: torch.Generator
     like: Tensor
@@ -173,14 +150,7 @@ class _Draw:
         return (low + (high - low) * self.uniform(*size)).exp()
 
     def scene(self, surface: Tensor, normals: Tensor, base: Tensor, forearm: float) -> _Scene:
-        """Return a thing that differs a little from the shape, and what is beside it.
-
-        Args:
-            surface: (B, N, 3) of the shape.
-            normals: (B, N, 3).
-            base: (B, 3) its origin.
-            forearm: share of the clouds with one.
-        """
+        """Return an object that differs a little from the surface (B, N, 3), and its surroundings."""
         batch, count = surface.shape[:2]
         axes = rotation_from_quaternion(_normal((batch, 4), self.generator, self.like))
         scale = 1 + _VARIETY.stretch * _normal((batch, 3, 1), self.generator, self.like)

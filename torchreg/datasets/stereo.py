@@ -124,28 +124,15 @@ def stereo_clouds(
     """Return stereo measurements of a shape in given poses, one cloud per pose, with the exact truth.
 
     Points lie at pixels of the left picture whose surface the right camera sees too, drawn uniformly from them. Four
-    tenths of the outliers lie on a forearm behind the wrist, where the shape is a hand and as far as it is seen, three
-    tenths on a wall behind the shape, the rest uniformly in the working volume: the box of all frames, slightly grown.
-    An obstacle hides surfaces behind it and adds outliers, 8 % as dense as the points of the shape.
+    tenths of the outliers lie on a forearm behind the wrist, where the shape is a hand and as far as it is visible,
+    three tenths on a wall behind the shape, the rest uniformly in the working volume: the box of all frames, slightly
+    grown. An obstacle hides surfaces behind it and adds outliers, 8 % as dense as the points of the shape.
 
     Args:
-        shape: the true shape.
-        poses: (T, num_dofs) true poses, before the cameras.
-        stereo: the cameras and their noise; `StereoView` by default.
-        skin: of the true surface, with faces that look outwards; by default `surface_skin`.
         num_points: points on the shape in the frame that shows most of it; the other frames have fewer, in proportion
             to the pixels that both cameras see.
-        outlier_ratio: outliers as a share of all points in that frame, at least 0 and below 1; every frame has the
-            same number. Points on an obstacle come on top.
-        obstacle: a still mesh, faces outwards, metres.
-        seed: of forearm, wall and measurements.
-
-    Returns:
-        T clouds, in the shape's dtype and on its device; those of frames that hide the shape hold outliers alone.
-
-    Raises:
-        InputError: if an argument is out of range, the skin has no faces, a surface reaches behind the cameras or no
-            frame shows the shape.
+        outlier_ratio: outliers as a share of all points in that frame, at least 0 and below 1; every frame has the same
+            number. Points on an obstacle come on top.
     """
     poses = shape.check_pose(poses, "poses").detach()
     check_shape(poses, "poses", ("T", shape.num_dofs))
@@ -176,9 +163,6 @@ class _StereoScene:
     """All surfaces before the cameras: the shape, its forearm if it is a hand, an obstacle, a wall.
 
     Args:
-        shape: the true shape.
-        skin: its surface.
-        poses: (T, num_dofs).
         surface: (T, V, 3) vertices of the skin.
         others: (T, W, 3) vertices of forearm and obstacle.
         faces: (F, 3) of the skin, the forearm and the obstacle.
@@ -265,9 +249,6 @@ class _VisiblePoints:
     Args:
         counts: pixels that show each owner.
         points: (N, 3) float64 each, without noise.
-        face: (N,) each.
-        barycentric: (N, 3) each.
-        wall: (N, 3) points on the wall.
     """
 
     counts: list[int]

@@ -15,7 +15,6 @@ class Body:
     """Parts that no joint separates.
 
     Args:
-        parts: indices of the parts.
         parent: index of a part of the parent body, -1 for the base itself.
         dofs: indices of the degrees of freedom between parent and body.
     """
@@ -27,12 +26,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Limb:
-    """A chain of bodies without branches, as a finger or an arm.
-
-    Args:
-        bodies: from the one nearest to the base outwards.
-        level: number of limbs between this one and the base.
-    """
+    """A chain of bodies without branches, from the base outwards; ``level`` limbs lie between it and the base."""
 
     bodies: tuple[Body, ...]
     level: int
@@ -52,11 +46,6 @@ def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
     """Return the limbs of a shape, parents before children, and the parts of its trunk, moved by the base alone.
 
     A degree of freedom that moves several limbs, as of a gripper, belongs to the first of them.
-
-    Args:
-        shape: the articulated shape.
-
-    Cost: nothing after the first time for a shape.
     """
     if shape not in _FOUND:
         _FOUND[shape] = _find_limbs(shape)

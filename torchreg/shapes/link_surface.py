@@ -32,13 +32,9 @@ _SAMPLING = _LinkSampling()
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """The mesh of a link, to be searched for its nearest point.
+    """Samples (S, 3) of the mesh of a link, float64, in part coordinates, with normals, to be searched for the nearest.
 
     Args:
-        part: index of the part that carries it.
-        points: (S, 3) float64 samples in part coordinates, metres.
-        normals: (S, 3) of the mesh there.
-        tree: of the samples.
         box: (2, 3) smallest and largest coordinates.
         is_closed: whether it has an inside.
     """
@@ -53,12 +49,7 @@ class LinkMesh:
 
 @dataclass(frozen=True, eq=False)
 class LinkMeshes:
-    """The meshes of all links of a shape.
-
-    Args:
-        links: those with a mesh.
-        spacing: of their samples, metres.
-    """
+    """The meshes of the links of a shape that have one, and the spacing of their samples, metres."""
 
     links: tuple[LinkMesh, ...]
     spacing: float
@@ -71,13 +62,7 @@ def has_rigid_links(shape: Articulation) -> bool:
 
 
 def link_meshes(shape: Articulation) -> LinkMeshes:
-    """Return the meshes of the links of a shape with `has_rigid_links`, made once for every shape.
-
-    Raises:
-        InputError: if the shape was not read from a file with a mesh.
-
-    Cost: 0.1 s the first time.
-    """
+    """Return the meshes of the links of a shape with `has_rigid_links`, made once for every shape."""
     surface = shape.surface
     if surface is None:
         raise InputError("this shape has no meshes: it was not read from a file with a mesh")
@@ -131,23 +116,15 @@ def _inside_sign(mesh: TriangleMesh) -> float:
 class LinkSurface:
     """The meshes of a shape's rigid links: signed distances to the nearest of them, where it is closed.
 
-    Samples stand for the meshes, each with its tangent plane, so dense that curvature does not count; beside an edge
-    the distance is that to the nearest sample.
-
-    Args:
-        shape: with `has_rigid_links`.
-
-    Cost: two searches of a tree per datum; 30 ms for 3,000 data on an arm of eight links.
+    Samples stand for the meshes, each with its tangent plane, so dense that curvature does not count; near an edge the
+    distance is that to the nearest sample.
     """
 
     def __init__(self, shape: Articulation) -> None:
         self.shape, self.meshes = shape, link_meshes(shape)
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres.
-
-        Differentiable: no; see `distance_jacobian`.
-        """
+        """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
         return self._nearest(points, self.shape.part_transforms(pose))[0]
 
     def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -187,10 +164,7 @@ class LinkSurface:
 
 
 def _search(meshes: LinkMeshes, local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return offsets (N, 3) from the nearest samples, their normals (N, 3) and links (N,), of points (L, N, 3).
-
-    First the link whose box is nearest is searched, then those whose boxes are nearer than what was found.
-    """
+    """Return offsets (N, 3) from the nearest samples, their normals (N, 3) and links (N,), of points (L, N, 3)."""
     boxes = torch.stack([link.box for link in meshes.links])
     low, high = boxes[:, None, 0], boxes[:, None, 1]
     bound = (torch.maximum(low - local, local - high).clamp_min(0)).norm(dim=-1)

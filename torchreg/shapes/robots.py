@@ -230,10 +230,7 @@ def _revolved(outline: Tensor) -> TriangleMesh:
 
 
 def solid_mesh(solid: UrdfPrimitive) -> TriangleMesh:
-    """Return a closed mesh of a solid of a robot description, in the coordinates of its link.
-
-    Round solids get 24 facets around their axis, with vertices on the surface.
-    """
+    """Return a closed mesh of a solid in the coordinates of its link; round ones get 24 facets around their axis."""
     mesh = _GEOMETRY[solid.kind](solid.size).mesh
     return TriangleMesh(transform_points(solid.origin, mesh.vertices), mesh.faces)
 

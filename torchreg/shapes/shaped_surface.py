@@ -13,7 +13,6 @@ class ShapedSurface(SkinSurface):
     """Distances of data to the tangent planes of a `ShapedSkin`, whose normals must be on the side of the data's.
 
     Args:
-        skin: samples of the surface, with three corners each.
         normals: (B, M, 3) of the data; zero where they are not known.
         reach: two spacings of the samples or so, metres, off the rim of which planes mean little.
     """

@@ -254,21 +254,7 @@ class BendingSkin(LinearBlendSkin):
 
 
 def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness: float | None = None) -> Tensor:
-    """Return the weights (N, P) of eq. 3, shared by the dominating part and its strongest neighbor.
-
-    Args:
-        shape: the articulated shape.
-        points: (N, 3), metres.
-        pose: (num_dofs,) the pose in which the fields are evaluated.
-        sharpness: a; the shape's own by default.
-
-    Returns:
-        Weights (N, P), rows sum to one, at most two entries per row.
-
-    Differentiable: in ``points``, ``pose`` and all parameters of the shape.
-
-    References: Dewaele et al. 2006, eq. 3.
-    """
+    """Return the weights (N, P) of eq. 3 for points (N, 3) in a pose, at most two per row, which sum to one."""
     distances = shape.part_distances(points, pose)
     nearest, dominating = distances.min(-1)
     neighbors = shape.adjacency[dominating].scatter(-1, dominating.unsqueeze(-1), False)

@@ -45,11 +45,7 @@ class ShapeSurface(Protocol):
 
 
 class FusedSurface:
-    """The fused surface of a shape's solids, eq. 2.
-
-    Args:
-        shape: the articulated shape.
-    """
+    """The fused surface of a shape's solids, eq. 2."""
 
     def __init__(self, shape: Articulation) -> None:
         self.shape = shape
@@ -64,13 +60,7 @@ class FusedSurface:
 
 
 class SkinSurface:
-    """A dense skin with normals: distances to the tangent plane of the nearest skin point.
-
-    For shapes from files with a mesh it is closer to the true surface than the fused solids.
-
-    Args:
-        skin: a skin with normals, dense enough that its points' tangent planes follow the surface.
-    """
+    """A dense skin with normals: distances to the tangent plane of the nearest skin point."""
 
     def __init__(self, skin: LinearBlendSkin) -> None:
         self.skin = skin
@@ -111,10 +101,7 @@ def _spacing(points: Tensor, first: Tensor) -> float:
 
 
 def _first_copies(skin: LinearBlendSkin) -> Tensor:
-    """Return the first point that coincides with each skin point in every pose: files split vertices along seams.
-
-    Copies may differ in their normals, and the choice between them must not depend on the search for neighbors.
-    """
+    """Return the first point that coincides with each skin point in every pose: files split vertices along seams."""
     group = torch.unique(skin.points, dim=0, return_inverse=True)[1]
     index = torch.arange(len(skin), device=group.device)
     first = torch.full_like(index, len(skin)).scatter_reduce(0, group, index, "amin")[group]
@@ -122,11 +109,7 @@ def _first_copies(skin: LinearBlendSkin) -> Tensor:
 
 
 def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
-    """Return a dense skin with normals of the file's mesh: its vertices, or samples if they are too many or too few.
-
-    Raises:
-        InputError: if the shape was not read from a file with a mesh.
-    """
+    """Return a dense skin with normals of the file's mesh: its vertices, or samples if they are too many or too few."""
     surface = shape.surface
     if surface is None:
         raise InputError("this shape has no file surface: it was not read from a file with a mesh")
