@@ -94,11 +94,9 @@ def creature_sequence(
 ) -> CreatureSequence:
     """Return a creature that bends and sways its arms while it turns and drifts, meshed anew in every frame.
 
-    Args:
-        touching: whether arms 0 and 1 merge in the middle third of the sequence: ``"none"``; ``"flanks"`` side by side,
-            the tips apart; ``"tips"`` end to end.
-        noise: standard deviation of the field at each voxel, in voxels.
-        resolution: voxels along the longest side of the box.
+    In the middle third of the sequence arms 0 and 1 touch: "none", "flanks" (side by side, the tips apart) or "tips"
+    (end to end). The noise is the standard deviation of the field at each voxel, in voxels; the resolution counts
+    voxels along the longest side of the box.
     """
     check_count(num_frames, "num_frames", 1)
     check_choice(touching, "touching", TOUCHING)

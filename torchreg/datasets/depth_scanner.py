@@ -58,11 +58,11 @@ class DepthScanner:
     def view(self, mesh: TriangleMesh, reach: float) -> View:
         """Return camera and pixels for all frames, from the first; ``reach`` is the tangent of half the view."""
         check_positive(reach, "reach")
-        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side, to measure the area that is seen
-        seen = int(self._measurable(mesh, first)[1].sum())
-        if not seen:
+        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side, to measure the visible area
+        pixels = int(self._measurable(mesh, first)[1].sum())
+        if not pixels:
             raise InputError("mesh must lie before the camera, which looks along +z, and face it; it sees nothing")
-        return _centered_view(first.pitch * math.sqrt(seen / self.num_points), reach)
+        return _centered_view(first.pitch * math.sqrt(pixels / self.num_points), reach)
 
     def scan(self, mesh: TriangleMesh, view: View, generator: torch.Generator, dtype: torch.dtype) -> SurfaceScan:
         """Return the camera's scan of a closed mesh with faces outwards; InputError if it shows nothing of it."""

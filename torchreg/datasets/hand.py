@@ -250,9 +250,9 @@ def hand_motion(
     - "rotate": the fingers half bent, it turns around its own axis once in 5 s;
     - "rotation": the fingers slightly bent, it turns to and fro by 60 to 70 degrees about an axis that is parallel to
       the picture and at most 25 degrees from upright;
-    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together, seen
+    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together, observed
       from the palm or from the back;
-    - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface seen before is hidden;
+    - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface visible before is hidden;
       4 s later it turns back;
     - "fast": as "bending_palm", swaying more, 3 to 4 times as fast;
     - "occlusion": in 1.5 s, about 2 s after the start, it passes through the middle of the picture from one side to
@@ -381,11 +381,8 @@ def _curl_groups(shape: ArticulatedShape) -> Tensor:
 def curled_joints(hand: Hand, own: Tensor, finger: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
     """Return joint angles (..., 21) of a hand whose fingers curl, and spread so that they do not meet.
 
-    Args:
-        own: (..., 21) draw of each joint, 0 to 1.
-        finger: (..., 21) draws of which each finger takes one.
-        spread: (..., 21) draw of the abductions, -1 to 1.
-        bend: share of the range to their limits that joints move at most, 0 to 1; (..., 1) or one for all.
+    Draws are (..., 21): of each joint and of each finger from 0 to 1, of the abductions from -1 to 1. ``bend`` is the
+    share of the range that joints move at most, (..., 1) or one for all.
     """
     # One draw per finger, and a little of one per joint.
     return _hand_joints(hand, bend * (0.8 * finger[..., _curl_groups(hand)] + 0.2 * own), spread, bend)

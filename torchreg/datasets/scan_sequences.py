@@ -191,13 +191,9 @@ def jointed_toy(
 ) -> ScanSequence:
     """Return scans of a toy whose joints are turned at random from frame to frame before a depth camera.
 
-    Args:
-        toy: a `robot` by default.
-        step: largest change of a joint angle between adjacent frames, radians.
-        turn: largest rotation of the toy about its vertical between adjacent frames, radians; it is also tilted by up
-            to 30 degrees.
-        missing: whether a part without children, drawn anew each time, is taken off in every second frame, so that one
-            scan of each adjacent pair lacks it (Chang and Zwicker 2009, figure 9).
+    Between adjacent frames joints turn by at most ``step`` and the toy about its vertical by at most ``turn``, radians;
+    it is also tilted by up to 30 degrees. With ``missing`` a part without children, drawn anew each time, is taken off
+    in every second frame (Chang and Zwicker 2009, figure 9).
     """
     check_count(frames, "frames", 2)
     check_positive(turn, "turn", allow_zero=True)

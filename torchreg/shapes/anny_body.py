@@ -81,7 +81,7 @@ def _hats(value: Tensor, anchors: Tensor) -> Tensor:
 
 
 def _hat_slopes(value: Tensor, anchors: Tensor) -> Tensor:
-    """Return the slopes of `_hats` (..., A) at values (...), at an anchor the mean of those beside it."""
+    """Return the slopes of `_hats` (..., A) at values (...), at an anchor the mean of both sides."""
     share = (value.unsqueeze(-1) - anchors[:-1]) / anchors.diff()
     inside = torch.heaviside(share, share.new_tensor(0.5)) * torch.heaviside(1 - share, share.new_tensor(0.5))
     slope = inside / anchors.diff()

@@ -131,9 +131,8 @@ class ForwardKinematics(nn.Module):
 def build_chain(tree: KinematicTree, names: Sequence[str], offsets: Tensor) -> Chain:
     """Return a tree as a `pytorch_kinematics.Chain`; a joint that mimics another moves by itself there.
 
-    Args:
-        names: of the frames, all different; line breaks at their ends, which pytorch-kinematics drops, are left out.
-        offsets: (F, 4, 4) of the frames from their parents; the chain has their dtype and device.
+    Line breaks at the ends of frames' names, which pytorch-kinematics drops, are left out. The chain has dtype and
+    device of the frames' offsets (F, 4, 4) from their parents.
     """
     import pytorch_kinematics as pk
 

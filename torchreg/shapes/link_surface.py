@@ -23,7 +23,7 @@ class _LinkSampling:
     """Numbers of the samples that stand for the meshes of links."""
 
     num_samples: int = 60_000  # of all links: 3 mm apart on an arm of half a square metre
-    reach: float = 2.0  # beside a sample, in their spacing, up to which its tangent plane stands for the mesh
+    reach: float = 2.0  # off a sample, in their spacing, up to which its tangent plane stands for the mesh
     open_share: float = 0.01  # of edges without a neighbor: a mesh with more has no inside
 
 
@@ -148,11 +148,11 @@ class LinkSurface:
         local = local.flatten(1, -2).cpu().double()
         offset, normal, link = _search(self.meshes, local)
         along, length = (offset * normal).sum(-1), offset.norm(dim=-1)
-        beside = (length.square() - along.square()).clamp_min(0).sqrt() > _SAMPLING.reach * self.meshes.spacing
+        off_plane = (length.square() - along.square()).clamp_min(0).sqrt() > _SAMPLING.reach * self.meshes.spacing
         outside = torch.where(along < 0, -1.0, 1.0)
-        away = torch.where(beside.unsqueeze(-1), offset / length.clamp_min(1e-12).unsqueeze(-1), normal)
-        away = torch.where(beside, outside, 1.0).unsqueeze(-1) * away
-        distance = torch.where(beside, outside * length, along)
+        away = torch.where(off_plane.unsqueeze(-1), offset / length.clamp_min(1e-12).unsqueeze(-1), normal)
+        away = torch.where(off_plane, outside, 1.0).unsqueeze(-1) * away
+        distance = torch.where(off_plane, outside * length, along)
         closed = torch.tensor([mesh.is_closed for mesh in self.meshes.links])
         flip = torch.where(~closed[link] & (distance < 0), -1.0, 1.0)
         link, part = link.to(points.device), torch.tensor(parts, device=points.device)[link]

@@ -72,11 +72,7 @@ class MaterialPoints(nn.Module):
         return len(self.points)
 
     def forward(self, transforms: Tensor, growth: Tensor, shares: Tensor | None = None) -> Tensor:
-        """Return the points (..., N, 3) for part transforms (..., P, 4, 4) and the growth (P, 4, 4) of the parts.
-
-        Args:
-            shares: (N,) of the partners in the motions of the points; none by default.
-        """
+        """Return the points (..., N, 3) for part transforms (..., P, 4, 4) and the growth (P, 4, 4) of the parts."""
         weights = self.weights
         if shares is not None and self.partners is not None:
             weights = weights + shares.unsqueeze(-1) * (self.partners - weights)
@@ -102,10 +98,7 @@ def fused_points(
 ) -> MaterialPoints:
     """Return points that cover the fused surface of solids evenly, under the bending skin.
 
-    Args:
-        frames: (P, 4, 4) of the solids in the reference pose.
-        neighbors: (P, P) booleans, which solids fuse; True on the diagonal.
-        to_parts: (P, 4, 4) in the reference pose.
+    The frames (P, 4, 4) of the solids and ``to_parts`` are those of the reference pose.
     """
     sizes = list(solids.sizes)
     # As many candidates for each solid as its size asks for.

@@ -148,7 +148,7 @@ class PosedTree(nn.Module):
             values: numbers or tensors (...) that broadcast, metres and radians.
 
         Raises:
-            InputError: if a name is unknown; it tells the nearest one.
+            InputError: if a name is unknown; the message names the nearest one.
 
         Differentiable: in the values.
         """
@@ -325,7 +325,7 @@ def named_pose(shape: PosedTree | None, pose: Tensor) -> dict[str, Any]:
 
 
 def frozen(value: Tensor) -> nn.Parameter:
-    """Return a parameter that takes no gradients until it is told to."""
+    """Return a parameter that takes no gradients until they are required."""
     return nn.Parameter(value, requires_grad=False)
 
 

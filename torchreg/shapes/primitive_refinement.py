@@ -23,7 +23,7 @@ class _RefinementSettings:
 
     # Robust scale of the residuals, in fusion lengths.
     robust_scale: float = 1.5
-    # Weight of the distance to the solid that owns a point, beside that of the fused distance.
+    # Weight of the distance to the solid that owns a point, relative to that of the fused distance.
     owner_weight: float = 0.3
     # Weight of the excess of that distance over the one to the nearest solid.
     excess_weight: float = 0.3
@@ -50,13 +50,9 @@ def refine_primitives(
     """Return solids moved, turned and resized so that their fused surface runs through points (N, 3) on the surface.
 
     Damped least squares over all solids at once (Marquardt 1963): the fused distance of every point, with less weight
-    the distance to the solid that owns it and its excess over that to the nearest solid, and a weak prior at the start,
-    which holds solids observed in part. Residuals beyond the fusion length lose weight.
-
-    Args:
-        primitives: first guess, one per part, with poses in the points' coordinates.
-        neighbors: (P, P) booleans, which solids fuse; True on the diagonal.
-        owners: (N,) part that each point belongs to.
+    the distance to the solid that owns it (N,) and its excess over that to the nearest solid, and a weak prior at the
+    start, which holds solids observed in part. Residuals beyond the fusion length lose weight. The solids have poses in
+    the points' coordinates.
     """
     solids = PrimitiveSet(primitives).requires_grad_(False)
     problem = _RefinementProblem(solids, neighbors, nu, points.double(), owners)
@@ -232,10 +228,8 @@ def _add_sets(
 ) -> None:
     """Add the terms of all points to the gradient (D,) and the Hessian (D, D), in place.
 
-    Args:
-        jacobians: (M, width, 3) of the pairs of points and solids, point after point.
-        parts: (M,) numbers of the pairs' solids.
-        sets: points in a row that have the same solids, and the number of these.
+    Jacobians (M, width, 3) are those of pairs of points and solids (M,), point after point; a set is a number of points
+    in a row that have the same solids, and the number of these.
     """
     width, pair, point = jacobians.shape[1], 0, 0
     entries = parts.unsqueeze(-1) * width + torch.arange(width)

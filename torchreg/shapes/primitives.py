@@ -18,7 +18,7 @@ from torchreg.geometry.rigid import RIGID_TOLERANCE, rigid_matrix, rotation_erro
 
 # Radius of a ball that holds a solid, in norms of its sizes: boxes reach their corners and capsules their round ends.
 BALL_FACTOR = 1.5
-# Exponent, to base 2, of a field that is negligible beside the dominating solid's field of one, in any precision.
+# Exponent, to base 2, of a field that is negligible next to the dominating solid's field of one, in any precision.
 _MIN_EXPONENT = -120.0
 
 

@@ -97,7 +97,7 @@ def build_shape(record: ShapeRecord) -> ArticulatedShape:
     with torch.no_grad():
         for tensor, value, learnable in zip(tensors, record.parameters, record.learnable, strict=True):
             tensor.copy_(value)
-            # In earlier releases everything required gradients unless it was told not to.
+            # In earlier releases everything required gradients by default.
             if isinstance(tensor, nn.Parameter) and not is_early:
                 tensor.requires_grad_(learnable)
     return shape

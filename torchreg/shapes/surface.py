@@ -23,7 +23,7 @@ class _DenseSkin:
     min_vertices: int = 800
     max_vertices: int = 6000
     num_samples: int = 4000
-    # Points that tell the spacing of a skin.
+    # Points from which the spacing of a skin is estimated.
     num_spacings: int = 500
     # A datum is off the rim of a skin if its offset is this oblique (distance to the plane over distance to the point)
     # and longer than this many spacings.
