@@ -37,7 +37,7 @@ class _Variety:
     neighbor: float = 0.15  # of the clouds, a second object of the same shape next to the first
     neighbor_distance: tuple[float, float] = (0.3, 1.0)  # of the two
     extra_points: tuple[float, float] = (0.1, 1.0)  # of a forearm or a second object for each of the first
-    beside_points: int = 600  # of which those are drawn
+    extra_samples: int = 600  # of which those are drawn
     hole: float = 0.4  # of the clouds, with a ball without points
     hole_radius: tuple[float, float] = (0.05, 0.25)
     thinned: float = 0.5  # of the clouds, of which some points lack
@@ -169,7 +169,7 @@ class _Draw:
 
     def forearm(self, base: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
         """Return oriented points (B, P, 3) of cones that begin at the base and lead away from the middle."""
-        batch, count = len(base), _VARIETY.extra_points_points
+        batch, count = len(base), _VARIETY.extra_samples
         axis = _unit(_unit(base - middle) + _VARIETY.forearm_turn * _normal((batch, 3), self.generator, self.like))
         axis = axis.unsqueeze(1)
         along = self.between(_VARIETY.forearm_length, batch, 1) * self.uniform(batch, count)
@@ -183,7 +183,7 @@ class _Draw:
         """Return oriented points (B, P, 3) of the next object of the batch, next to each."""
         distance = self.size * self.between(_VARIETY.neighbor_distance, len(surface), 1, 1)
         offset = distance * _unit(_normal((len(surface), 1, 3), self.generator, self.like))
-        some = torch.linspace(0, surface.shape[1] - 1, _VARIETY.extra_points_points, device=surface.device).long()
+        some = torch.linspace(0, surface.shape[1] - 1, _VARIETY.extra_samples, device=surface.device).long()
         return surface[:, some].roll(1, 0) + offset, normals[:, some].roll(1, 0)
 
     def visible(self, surface: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:

@@ -250,8 +250,8 @@ def hand_motion(
     - "rotate": the fingers half bent, it turns around its own axis once in 5 s;
     - "rotation": the fingers slightly bent, it turns to and fro by 60 to 70 degrees about an axis that is parallel to
       the picture and at most 25 degrees from upright;
-    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together, observed
-      from the palm or from the back;
+    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together,
+      with the palm or the back to the camera;
     - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface visible before is hidden;
       4 s later it turns back;
     - "fast": as "bending_palm", swaying more, 3 to 4 times as fast;

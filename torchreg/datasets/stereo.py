@@ -230,7 +230,7 @@ def _forearm(hand: Hand, bend: Tensor) -> TriangleMesh:
 
 
 def tube(rings: Tensor) -> TriangleMesh:
-    """Return the open tube through rings (R, S, 3); it faces outwards where they run clockwise as viewed from the next."""
+    """Return the open tube through rings (R, S, 3); it faces outwards where they run clockwise from the next."""
     levels, sides = rings.shape[:2]
     corner = torch.arange(levels - 1).unsqueeze(-1) * sides + torch.arange(sides)
     following = corner.roll(-1, dims=1)
