@@ -57,10 +57,7 @@ _MESHES: dict[tuple[object, ...], TriangleMesh] = {}
 
 
 class Articulation(PosedTree):
-    """Parts on a kinematic tree and their fused surface, in any pose: the basis of skins and of shapes from files.
-
-    See `ArticulatedShape`, which is made from files as well, for conventions, arguments and parameters.
-    """
+    """Parts on a kinematic tree and their fused surface; `ArticulatedShape` explains conventions and arguments."""
 
     _started: Tensor
 

@@ -302,11 +302,7 @@ def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute:
 
 
 def _doubling(tree: KinematicTree) -> tuple[Tensor, Tensor, list[int], list[Tensor]]:
-    """Return the order of frames by depth, its inverse, and per round of products the number of complete frames.
-
-    In a round every incomplete frame is multiplied with the product that its next ancestor holds so far; the indices of
-    these ancestors in the order come last.
-    """
+    """Return the order of frames by depth, its inverse, and per round the number of complete frames and ancestors."""
     depths: list[int] = []
     for joint in tree.joints:
         depths.append(0 if joint.parent < 0 else depths[joint.parent] + 1)

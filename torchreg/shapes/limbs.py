@@ -43,10 +43,7 @@ class Limb:
 
 
 def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
-    """Return the limbs of a shape, parents before children, and the parts of its trunk, moved by the base alone.
-
-    A degree of freedom that moves several limbs, as of a gripper, belongs to the first of them.
-    """
+    """Return the limbs, parents before children, and the parts of the trunk; a shared joint is the first limb's."""
     if shape not in _FOUND:
         _FOUND[shape] = _find_limbs(shape)
     limbs, trunk = _FOUND[shape]

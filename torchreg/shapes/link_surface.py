@@ -32,12 +32,7 @@ _SAMPLING = _LinkSampling()
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """Samples (S, 3) of the mesh of a link, float64, in part coordinates, with normals, to be searched for the nearest.
-
-    Args:
-        box: (2, 3) smallest and largest coordinates.
-        is_closed: whether it has an inside.
-    """
+    """Samples (S, 3) of a link's mesh in its part's coordinates, float64, their normals, search tree and box (2, 3)."""
 
     part: int
     points: Tensor

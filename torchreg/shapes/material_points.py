@@ -132,11 +132,7 @@ def onto_fused(
     fuses: Tensor,
     nu: float | Tensor,
 ) -> Tensor:
-    """Return points (..., N, 3) after one Newton step onto their fused surface, ``x - d grad d / |grad d|^2``.
-
-    Each point keeps the solids ``fuses`` (N, P) that it is fused from: a finger that touches another leaves its points
-    alone. Frames (..., P, 3, 4) are ``[R | t]`` of the solids.
-    """
+    """Return points (..., N, 3) after one Newton step onto their fused surface, ``x - d grad d / |grad d|^2``."""
     inverse = frames[..., :3].mT
     local = (inverse.flatten(-3, -2) @ points.mT).unflatten(-2, (-1, 3)) - inverse @ frames[..., 3:]
     x, y, z = local.unbind(-2)

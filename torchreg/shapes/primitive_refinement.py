@@ -169,11 +169,7 @@ class _RefinementProblem:
         return 0.5 * (robust + (self._stiffness * fields.offset.square()).sum())
 
     def derivatives(self, fields: _Fields) -> tuple[Tensor, Tensor]:
-        """Return gradient (D,) and Gauss-Newton Hessian (D, D) at a state.
-
-        Only pairs of points and the few solids that share in their distance are differentiated; points with the same
-        solids are taken together.
-        """
+        """Return gradient (D,) and Gauss-Newton Hessian (D, D) at a state; points with the same solids go together."""
         gradient, hessian = (self._stiffness * fields.offset).flatten(), self._stiffness.flatten().diag()
         concerned = fields.shares > _REFINEMENT.least_share
         for always in (self.owners, fields.nearest):

@@ -222,11 +222,7 @@ def _in_order(groups: Sequence[_KindRows], planes: Sequence[Tensor]) -> Tensor:
 
 
 def fuse(distances: Tensor, neighbors: Tensor, nu: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distance (...) to the fused surface, ``-nu log phi``, and the weights (..., P) of its gradient.
-
-    phi sums the fields ``exp(-d_q / nu)`` of the dominating solid and its neighbors (P, P) only, in the log domain:
-    Dewaele et al. 2006, eqs. 1 and 2.
-    """
+    """Return the distance (...) to the fused surface, ``-nu log phi``, and its weights (..., P); eqs. 1 and 2."""
     nearest, dominating = distances.min(dim=-1, keepdim=True)
     # Zero or one per point and solid; in the memory order of distances of planes.
     fuses = neighbors.to(distances.dtype).index_select(-1, dominating.flatten())
