@@ -114,11 +114,7 @@ class ForwardKinematics(nn.Module):
         return local.view(*local.shape[:-1], 4, 4)
 
     def joint_twists(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the twists (..., J, 6) of the moving joints, (translation, rotation), and the frames (F, J) they move.
-
-        A joint k moves a point x of a frame below it by ``linear_k + angular_k x x`` per unit (Murray, Li, Sastry
-        1994). `couplings` (J, num_dofs) maps moving joints to degrees of freedom.
-        """
+        """Return the twists (..., J, 6) of moving joints, (translation, rotation), and the frames (F, J) they move."""
         joints = frames.index_select(-3, self.joint_frames)[..., :3, :]
         rotation = joints[..., :3]
         angular = (rotation @ self.rotation_axes).squeeze(-1)
@@ -129,11 +125,7 @@ class ForwardKinematics(nn.Module):
 
 
 def build_chain(tree: KinematicTree, names: Sequence[str], offsets: Tensor) -> Chain:
-    """Return a tree as a `pytorch_kinematics.Chain`; a joint that mimics another moves by itself there.
-
-    Line breaks at the ends of frames' names, which pytorch-kinematics drops, are left out. The chain has dtype and
-    device of the frames' offsets (F, 4, 4) from their parents.
-    """
+    """Return a tree as a `pytorch_kinematics.Chain`, in dtype and device of the offsets; mimics move by themselves."""
     import pytorch_kinematics as pk
 
     kind = {"dtype": offsets.dtype, "device": offsets.device}
@@ -284,10 +276,7 @@ def _axis_of(joint: Joint) -> Tensor:
 
 
 def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute: Tensor) -> dict[str, Tensor]:
-    """Return tables (F, 16) whose sum, weighted by 1, scale, sine, cosine and value, is a frame's pose in its parent.
-
-    A rotation about a unit axis a is ``a a^T + cos (I - a a^T) + sin [a]x``.
-    """
+    """Return tables (F, 16) whose sum, weighted by 1, scale, sine, cosine and value, is a pose in the parent."""
     motions = {name: torch.zeros(len(offsets), 4, 4, dtype=torch.float64) for name in ("sines", "cosines", "slides")}
     along = axes.unsqueeze(-1) * axes.unsqueeze(-2)
     revolute = is_revolute[:, None, None]

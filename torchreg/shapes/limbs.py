@@ -12,12 +12,7 @@ from torchreg.shapes.articulation import Articulation
 
 @dataclass(frozen=True)
 class Body:
-    """Parts that no joint separates.
-
-    Args:
-        parent: index of a part of the parent body, -1 for the base itself.
-        dofs: indices of the degrees of freedom between parent and body.
-    """
+    """Parts that no joint separates, a part of the parent body (-1: the base), and the joints between them."""
 
     parts: tuple[int, ...]
     parent: int

@@ -109,11 +109,7 @@ def _inside_sign(mesh: TriangleMesh) -> float:
 
 
 class LinkSurface:
-    """The meshes of a shape's rigid links: signed distances to the nearest of them, where it is closed.
-
-    Samples stand for the meshes, each with its tangent plane, so dense that curvature does not count; near an edge the
-    distance is that to the nearest sample.
-    """
+    """The meshes of a shape's rigid links: signed distances to tangent planes of their nearest samples."""
 
     def __init__(self, shape: Articulation) -> None:
         self.shape, self.meshes = shape, link_meshes(shape)

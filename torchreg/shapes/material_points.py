@@ -96,10 +96,7 @@ def mesh_points(surface: RigSurface, to_parts: Tensor) -> MaterialPoints:
 def fused_points(
     solids: PrimitiveSet, frames: Tensor, neighbors: Tensor, nu: float, to_parts: Tensor
 ) -> MaterialPoints:
-    """Return points that cover the fused surface of solids evenly, under the bending skin.
-
-    The frames (P, 4, 4) of the solids and ``to_parts`` are those of the reference pose.
-    """
+    """Return points that cover the fused surface of solids with frames (P, 4, 4) at reference evenly."""
     sizes = list(solids.sizes)
     # As many candidates for each solid as its size asks for.
     across, _, along = solids.half_extents(sizes).unbind(-1)

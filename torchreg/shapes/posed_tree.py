@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 
 class PosedTree(nn.Module):
-    """Parts on a kinematic tree with a base that moves; see `ArticulatedShape` for conventions and arguments.
-
-    Attributes:
-        is_sliding: (num_dofs,) bool, degrees of freedom in metres: the base's translation and prismatic joints.
-    """
+    """Parts on a kinematic tree with a moving base; `ArticulatedShape` explains conventions and arguments."""
 
     adjacency: Tensor
     part_index: Tensor

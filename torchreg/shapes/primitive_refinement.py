@@ -222,11 +222,7 @@ def _add_sets(
     gradient: Tensor,
     hessian: Tensor,
 ) -> None:
-    """Add the terms of all points to the gradient (D,) and the Hessian (D, D), in place.
-
-    Jacobians (M, width, 3) are those of pairs of points and solids (M,), point after point; a set is a number of points
-    in a row that have the same solids, and the number of these.
-    """
+    """Add the terms of all points to gradient and Hessian in place; sets are (points, solids of each) in a row."""
     width, pair, point = jacobians.shape[1], 0, 0
     entries = parts.unsqueeze(-1) * width + torch.arange(width)
     for count, solids in sets:

@@ -107,10 +107,7 @@ def spec_from_arrays(
     slides: Sequence[str] = (),
     up: Direction = Y_UP,
 ) -> ShapeSpec:
-    """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`.
-
-    Solids, in their joints' frames, are fitted unless they are given. Joints in ``slides`` slide too, along all axes.
-    """
+    """Return the `ShapeSpec` of a skinned mesh, as `from_skinned_mesh`; joints in ``slides`` slide as well."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
     vertices = as_float_tensor(vertices, "vertices").double()
     frames = _joint_frames(as_float_tensor(joints, "joints").double())
