@@ -44,17 +44,6 @@ def test_parts_are_where_pytorch_kinematics_puts_them(shapes, name):
     assert [limits[joint] for joint in shape.dof_names[6:]] == list(own)
 
 
-def test_gradients_of_keypoints_equal_those_of_pytorch_kinematics(hand):
-    pose = (0.3 * seeded(hand.num_dofs)).index_fill(0, torch.arange(6), 0.0).requires_grad_(True)
-    order = [hand.dof_names.index(name) for name in hand.chain.get_joint_parameter_names()]
-    weights = seeded(hand.num_parts, 3, seed=1)
-    found = hand.chain.forward_kinematics(pose[order].unsqueeze(0))
-    theirs = torch.stack([found[part].get_matrix()[0, :3, 3] for part in hand.part_names])
-    (expected,) = torch.autograd.grad((weights * theirs).sum(), pose)
-    (gradient,) = torch.autograd.grad((weights * hand.part_transforms(pose)[:, :3, 3]).sum(), pose)
-    compare([gradient[6:]], [expected[6:]])
-
-
 @torch.no_grad()
 def test_a_chain_has_the_dtype_of_its_shape_and_does_not_follow_it():
     hand = tr.Hand()

@@ -96,17 +96,6 @@ def test_data_between_skin_points_are_near_the_surface():
     torch.testing.assert_close(found, torch.full_like(found, 0.0001))
 
 
-def test_beside_an_open_skin_the_distance_is_to_its_rim(two_balls):
-    """A single patch of skin: far beside it the plane would be near, but the patch is not."""
-    weights = torch.tensor([[1.0, 0.0]], dtype=D)
-    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=D)
-    skin = tr.LinearBlendSkin(two_balls, torch.zeros(1, 3), weights, two_balls.rest_pose(), normals=up)
-    points = torch.tensor([[0.3, 0.0, 0.01], [0.3, 0.4, -0.01], [0.01, 0.0, 0.3]], dtype=D)
-    found = SkinSurface(skin).distance(points, two_balls.rest_pose())
-    expected = torch.tensor([math.hypot(0.3, 0.01), -math.hypot(0.5, 0.01), 0.3], dtype=D)
-    torch.testing.assert_close(found, expected)
-
-
 @torch.no_grad()
 def test_jacobian_matches_differences(two_balls, ball_skin):
     pose, surface = random_pose(two_balls, 2), SkinSurface(ball_skin)

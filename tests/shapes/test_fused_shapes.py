@@ -1,6 +1,5 @@
 """Shapes of solids: which parts fuse, some parts alone, sizes that are learned or held, and the meshed surface."""
 
-import copy
 import math
 
 import numpy as np
@@ -151,13 +150,6 @@ def test_the_state_holds_parameters_and_what_they_multiply(crane):
     assert {name for name, _ in crane.named_parameters()} == names
     solids = {"primitives.centers", *(f"primitives.sizes.{kind}" for kind in range(4))}
     assert {name for name in crane.state_dict() if not name.startswith("surface_points.")} == names | solids
-    other = copy.deepcopy(crane)
-    with torch.no_grad():
-        for value in crane.state_dict().values():
-            value.mul_(1.1)
-    other.load_state_dict(crane.state_dict())
-    assert torch.equal(other.distance(cloud(), POSE), crane.distance(cloud(), POSE))
-    assert torch.equal(other(POSE).points, crane(POSE).points)
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ import torch
 import torchreg as tr
 from tests.shapes.kinds import D, at, compare
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.link_surface import LinkSurface, has_rigid_links, link_meshes
+from torchreg.shapes import link_surface
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.spec import RigSurface
 
@@ -66,7 +66,7 @@ def test_distances_are_those_to_the_nearer_box(arm):
     points = around(arm, POSE)
     exact = box_distances(arm, points, POSE)
     nearest = exact.gather(0, exact.abs().argmin(0, keepdim=True))[0]
-    surface = LinkSurface(arm)
+    surface = link_surface.LinkSurface(arm)
     # A plane is taken to go on for two spacings beyond an edge.
     torch.testing.assert_close(surface.distance(points, POSE), nearest, rtol=0, atol=2 * surface.meshes.spacing)
     near = nearest.abs() < 0.02
@@ -76,7 +76,7 @@ def test_distances_are_those_to_the_nearer_box(arm):
 
 def test_jacobian_matches_differences(arm):
     points = around(arm, POSE, 80)
-    surface = LinkSurface(arm)
+    surface = link_surface.LinkSurface(arm)
     distance, jacobian = surface.distance_jacobian(points, POSE)
     torch.testing.assert_close(distance, surface.distance(points, POSE))
     steps = 1e-7 * torch.eye(7, dtype=D)
@@ -88,7 +88,7 @@ def test_jacobian_matches_differences(arm):
 
 
 def test_batches_are_loops_and_the_surface_moves_with_the_base(arm):
-    surface = LinkSurface(arm)
+    surface = link_surface.LinkSurface(arm)
     poses = torch.stack([POSE, POSE.flip(0), torch.zeros(7, dtype=D)])
     points = torch.stack([around(arm, pose, 50) for pose in poses])
     distance, jacobian = surface.distance_jacobian(points, poses)
@@ -96,7 +96,7 @@ def test_batches_are_loops_and_the_surface_moves_with_the_base(arm):
         compare((distance[row], jacobian[row]), surface.distance_jacobian(points[row], poses[row]))
     grid = surface.distance(points.unsqueeze(1), torch.stack([poses, poses.flip(0)], dim=1))
     torch.testing.assert_close(grid[0, 1], surface.distance(points[0], poses[2]))
-    single = LinkSurface(two_boxes().float()).distance(points.float(), poses.float())
+    single = link_surface.LinkSurface(two_boxes().float()).distance(points.float(), poses.float())
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), distance, rtol=0, atol=1e-3)
 
@@ -104,9 +104,9 @@ def test_batches_are_loops_and_the_surface_moves_with_the_base(arm):
 def test_meshes_turned_inside_out_are_turned_back_and_open_ones_have_no_inside(arm):
     inside = POSE[:3].unsqueeze(0)
     points = torch.cat([inside, around(arm, POSE, 60)])
-    turned = LinkSurface(two_boxes(turned_in=True)).distance(points, POSE)
-    torch.testing.assert_close(turned, LinkSurface(arm).distance(points, POSE), rtol=0, atol=1e-3)
-    surface = LinkSurface(two_boxes(drop=2))
+    turned = link_surface.LinkSurface(two_boxes(turned_in=True)).distance(points, POSE)
+    torch.testing.assert_close(turned, link_surface.LinkSurface(arm).distance(points, POSE), rtol=0, atol=1e-3)
+    surface = link_surface.LinkSurface(two_boxes(drop=2))
     assert [link.is_closed for link in surface.meshes.links] == [True, False]
     frame = arm.part_transforms(POSE)[1]
     in_second = (frame[:3, :3] @ MIDDLE + frame[:3, 3]).unsqueeze(0)
@@ -115,18 +115,18 @@ def test_meshes_turned_inside_out_are_turned_back_and_open_ones_have_no_inside(a
 
 
 def test_meshes_are_made_once_for_a_shape_and_its_surface(arm):
-    assert link_meshes(arm) is link_meshes(arm)
+    assert link_surface.link_meshes(arm) is link_surface.link_meshes(arm)
     other = two_boxes()
-    before = link_meshes(other)
+    before = link_surface.link_meshes(other)
     other.surface = two_boxes(drop=2).surface
-    assert link_meshes(other) is not before
+    assert link_surface.link_meshes(other) is not before
     area = 4 * float(SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[2] * SIZE[0])
-    assert link_meshes(arm).spacing == pytest.approx(math.sqrt(area / 60_000))
+    assert link_surface.link_meshes(arm).spacing == pytest.approx(math.sqrt(area / 60_000))
 
 
 def test_shapes_that_blend_or_have_no_mesh_have_no_rigid_links(arm):
-    assert has_rigid_links(arm)
-    assert not has_rigid_links(tr.Hand())
+    assert link_surface.has_rigid_links(arm)
+    assert not link_surface.has_rigid_links(tr.Hand())
     blended = arm.surface.weights.clone()
     blended[0] = 0.5
     prop = RigSurface(arm.surface.vertices, arm.surface.faces, arm.surface.weights)
@@ -134,4 +134,4 @@ def test_shapes_that_blend_or_have_no_mesh_have_no_rigid_links(arm):
     for surface, is_rigid in ((prop, True), (skin, False)):
         other = two_boxes()
         other.surface = surface
-        assert has_rigid_links(other) is is_rigid
+        assert link_surface.has_rigid_links(other) is is_rigid

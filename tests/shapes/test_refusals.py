@@ -10,8 +10,7 @@ from torch import nn
 import torchreg as tr
 from tests.shapes.kinds import D, at, machine, robot, seeded, tube
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes import pose_conversions
-from torchreg.shapes.link_surface import link_meshes
+from torchreg.shapes import link_surface, pose_conversions
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.record import build_shape, record_shape
 from torchreg.shapes.surface import dense_file_skin
@@ -107,7 +106,7 @@ REFUSED = [
     (lambda: tr.Hand(sharpness=-1.0), InputError, "sharpness must be positive and finite, got -1"),
     (HAND.file_skin, InputError, "this shape has no file skin"),
     (lambda: dense_file_skin(HAND), InputError, "no file surface: it was not read from a file with a mesh"),
-    (lambda: link_meshes(HAND), InputError, "no meshes: it was not read from a file with a mesh"),
+    (lambda: link_surface.link_meshes(HAND), InputError, "no meshes: it was not read from a file with a mesh"),
     (lambda: tr.ArticulatedShape.from_anny("face"), InputError, "kind must be one of"),
     # Skins.
     (lambda: skin(weights=torch.ones(2, 16)), InputError, "weights must not be negative and every row must sum to one"),

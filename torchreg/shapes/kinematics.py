@@ -26,9 +26,8 @@ _MAX_DEPTH = 300
 class ForwardKinematics(nn.Module):
     """Maps joint values to frame transforms, for any number of leading batch dimensions.
 
-    Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. The transform of a frame
-    in its parent is linear in sine, cosine and value of its joint; each round of products doubles the number of
-    generations between a frame and the ancestor that it is given in (Hillis and Steele 1986).
+    A frame's transform in its parent is linear in sine, cosine and value of its joint; each round of products doubles
+    the number of generations between a frame and the ancestor that it is given in (Hillis and Steele 1986).
     """
 
     axes: Tensor

@@ -50,9 +50,8 @@ def refine_primitives(
     """Return solids moved, turned and resized so that their fused surface runs through points (N, 3) on the surface.
 
     Damped least squares over all solids at once (Marquardt 1963): the fused distance of every point, with less weight
-    the distance to the solid that owns it (N,) and its excess over that to the nearest solid, and a weak prior at the
-    start, which holds solids observed in part. Residuals beyond the fusion length lose weight. The solids have poses in
-    the points' coordinates.
+    the distance to its own solid (N,) and its excess over that to the nearest solid, and a weak prior at the start,
+    which holds solids observed in part. The solids have poses in the points' coordinates.
     """
     solids = PrimitiveSet(primitives).requires_grad_(False)
     problem = _RefinementProblem(solids, neighbors, nu, points.double(), owners)

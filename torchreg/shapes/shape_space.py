@@ -15,9 +15,7 @@ RestFunction = Callable[[Tensor], tuple[Tensor, Tensor]]
 class CoefficientPrior:
     """A prior on K shape coefficients: mean, standard deviations and limits.
 
-    Args:
-        alike: (K,) numbers of groups of coefficients whose common deviation is not known, of which ``std`` is a guess;
-            -1 for others. None where there are no such groups.
+    Coefficients of one number in ``alike`` (K,) share an unknown deviation, of which ``std`` is a guess; -1: others.
     """
 
     names: tuple[str, ...]
@@ -90,7 +88,6 @@ class LinearSpace(ShapeSpace):
 
     Args:
         vertex_dirs: (V, 3, L).
-        frames: (F, 3) where the features are zero, metres.
         features: takes coefficients (..., K) to features (..., L); None where they are the coefficients.
     """
 
