@@ -1,13 +1,12 @@
-"""Made-up clouds in batches: what is beside a thing is no part of it, and is seen as a camera sees it."""
+"""Made-up clouds in batches: points of the shape as a camera observes them, and points of other objects."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.datasets import cloud_batches
-from torchreg.datasets.cloud_batches import random_clouds, random_poses
-from torchreg.shapes.skin import sample_skin
 
 SIZE = 0.26
 BARE = {
@@ -16,26 +15,30 @@ BARE = {
 }  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def skin(plain_hand):
+    return tr.sample_skin(plain_hand, 1500)
+
+
 @pytest.fixture
-def drawn(plain_hand, monkeypatch):
-    """A function that draws clouds in which only what is named differs."""
-    skin = sample_skin(plain_hand, 1500)
+def drawn(plain_hand, skin, monkeypatch):
+    """A function that draws clouds which vary in what is named only."""
 
     def draw(**changes):
         variety = replace(cloud_batches._VARIETY, **(BARE | changes))
         monkeypatch.setattr(cloud_batches, "_VARIETY", variety)
         generator = torch.Generator().manual_seed(2)
-        return random_clouds(skin, SIZE, random_poses(plain_hand, 8, generator), 300, generator)
+        poses = cloud_batches.random_poses(plain_hand, 8, generator)
+        return cloud_batches.random_clouds(skin, SIZE, poses, 300, generator)
 
     return draw
 
 
-def test_bare_clouds_are_points_of_the_posed_skin(plain_hand, drawn):
+def test_bare_clouds_are_points_of_the_posed_skin(skin, drawn):
     batch = drawn()
     assert batch.mask.all()
     assert (batch.index >= 0).all()
-    posed = sample_skin(plain_hand, 1500)(batch.poses)
-    there = posed.gather(1, batch.index.unsqueeze(-1).expand(-1, -1, 3))
+    there = skin(batch.poses).gather(1, batch.index.unsqueeze(-1).expand(-1, -1, 3))
     torch.testing.assert_close(batch.points, there, atol=1e-5, rtol=0)
 
 
@@ -52,16 +55,13 @@ def test_a_forearm_is_no_part_of_the_hand_and_leads_away_from_it(plain_hand, dra
     assert along[~arm].mean() < 0
 
 
-def test_another_thing_beside_the_first_hides_some_of_it(drawn):
-    alone, beside = drawn(), drawn(neighbor=1.0)
-    assert (alone.index >= 0).all()
-    assert ((beside.index < 0).double().mean(1) > 0.02).all()
+def test_a_second_object_is_part_of_the_cloud(drawn):
+    assert ((drawn(neighbor=1.0).index < 0).double().mean(1) > 0.02).all()
 
 
-def test_things_differ_from_the_shape_by_a_share_of_its_size(plain_hand, drawn):
+def test_objects_differ_from_the_shape_by_a_share_of_its_size(skin, drawn):
     batch = drawn(stretch=0.06)
-    posed = sample_skin(plain_hand, 1500)(batch.poses)
-    there = posed.gather(1, batch.index.clamp_min(0).unsqueeze(-1).expand(-1, -1, 3))
+    there = skin(batch.poses).gather(1, batch.index.clamp_min(0).unsqueeze(-1).expand(-1, -1, 3))
     off = (batch.points - there).norm(dim=-1)[batch.mask].mean()
     reach = (there - batch.poses[:, None, :3]).norm(dim=-1)[batch.mask].mean()
     # A stretch along axes at random moves a point by its distance from the base times the deviation.

@@ -5,20 +5,19 @@ import math
 import pytest
 import torch
 
-from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.datasets.solids import RoundBox, ball, mesh_of
-from torchreg.geometry.range_scan import RangeScan
-from torchreg.geometry.rigid import transform_points
+import torchreg as tr
+from torchreg.datasets import depth_scanner, scan_sequences, solids
 
 MIDDLE = (0.1, 0.05, 3.0)
-BALL = mesh_of([ball(MIDDLE, 0.5)], 0.05)
-CLEAN = DepthScanner(noise=0.0, num_holes=0)
+BALL = solids.mesh_of([solids.ball(MIDDLE, 0.5)], 0.05)
+CLEAN = depth_scanner.DepthScanner(noise=0.0, num_holes=0)
 
 
 @pytest.fixture(scope="module")
 def toy():
-    return jointed_toy(8, missing=True, dtype=torch.float64, scanner=DepthScanner(2500, noise=0.0, num_holes=0))
+    return scan_sequences.jointed_toy(
+        8, missing=True, dtype=torch.float64, scanner=depth_scanner.DepthScanner(2500, noise=0.0, num_holes=0)
+    )
 
 
 def scan(scanner, mesh=BALL, seed=0, dtype=torch.float64):
@@ -45,12 +44,12 @@ def test_rigid_parts_move_as_their_transforms_say(toy):
     pair = toy.pair(0, 1)
     for part in pair.labels.unique().tolist():
         own = pair.labels == part
-        moved = transform_points(pair.transforms[part], pair.source.points[own])
+        moved = pair.source.points[own] @ pair.transforms[part, :3, :3].mT + pair.transforms[part, :3, 3]
         torch.testing.assert_close(moved, pair.truth[own], atol=1e-9, rtol=0)
     for number, parts in enumerate(pair.joint_parts.tolist()):
         for part in parts:
-            moved = transform_points(pair.transforms[part], pair.joints[number : number + 1])
-            torch.testing.assert_close(moved[0], pair.target_joints[number])
+            moved = pair.transforms[part, :3, :3] @ pair.joints[number] + pair.transforms[part, :3, 3]
+            torch.testing.assert_close(moved, pair.target_joints[number])
 
 
 def test_missing_parts_are_missing_in_every_other_frame(toy):
@@ -75,7 +74,7 @@ def test_every_way_to_ask_gives_the_same(toy):
         (alone.labels, toy.labels(3)), (alone.joints, toy.joints(3)), (toy[-1].points, toy[7].points),
     ):  # fmt: skip
         assert torch.equal(one, other)
-    assert all(isinstance(frame, RangeScan) for frame in toy)
+    assert all(isinstance(frame, tr.RangeScan) for frame in toy)
 
 
 def test_a_clean_scan_lies_exactly_where_it_says():
@@ -89,13 +88,13 @@ def test_a_clean_scan_lies_exactly_where_it_says():
     assert bool(((out * found.scan.points).sum(-1) < 0).all())
     assert bool(((found.scan.normals * found.scan.points).sum(-1) < 0).all())
     for count in (500, 3000):
-        assert abs(len(scan(DepthScanner(num_points=count)).scan) / count - 1) < 0.1
+        assert abs(len(scan(depth_scanner.DepthScanner(num_points=count)).scan) / count - 1) < 0.1
 
 
 def test_noise_grows_with_depth_and_lies_along_the_rays():
     spreads = []
-    for mesh in (BALL, mesh_of([ball((0, 0, 6), 1.0)], 0.1)):
-        found = scan(DepthScanner(noise=1e-3, num_holes=0, num_points=4000), mesh)
+    for mesh in (BALL, solids.mesh_of([solids.ball((0, 0, 6), 1.0)], 0.1)):
+        found = scan(depth_scanner.DepthScanner(noise=1e-3, num_holes=0, num_points=4000), mesh)
         truth = found.transferred(mesh.vertices, mesh.faces)
         error = found.scan.points - truth
         assert float(torch.linalg.cross(error, truth).norm(dim=-1).max()) < 1e-9
@@ -105,17 +104,17 @@ def test_noise_grows_with_depth_and_lies_along_the_rays():
 
 def test_slanted_surfaces_and_holes_are_not_measured():
     for limit, slant in ((85, math.pi / 2), (52, math.radians(50))):
-        points = scan(DepthScanner(noise=0.0, num_holes=0, max_slant=slant)).scan.points
+        points = scan(depth_scanner.DepthScanner(noise=0.0, num_holes=0, max_slant=slant)).scan.points
         out = torch.nn.functional.normalize(points - points.new_tensor(MIDDLE), dim=-1)
         angle = torch.rad2deg(torch.acos(-(out * torch.nn.functional.normalize(points, dim=-1)).sum(-1)))
         assert limit - 6 < float(angle.max()) < limit + 6
-    holes = DepthScanner(noise=0.0, num_holes=3, hole_radius=0.05)
+    holes = depth_scanner.DepthScanner(noise=0.0, num_holes=3, hole_radius=0.05)
     assert len(scan(holes).scan) < 0.97 * len(scan(CLEAN).scan)
 
 
 def test_what_stands_before_something_hides_it():
-    wall, post = RoundBox((0, 0, 3), (0.8, 0.8, 0.05), 0.01), RoundBox((0, 0, 2), (0.1, 0.6, 0.05), 0.01)
-    points = scan(CLEAN, mesh_of([wall, post], 0.05)).scan.points
+    wall, post = solids.RoundBox((0, 0, 3), (0.8, 0.8, 0.05), 0.01), solids.RoundBox((0, 0, 2), (0.1, 0.6, 0.05), 0.01)
+    points = scan(CLEAN, solids.mesh_of([wall, post], 0.05)).scan.points
     behind = points[points[:, 2] > 2.5]
     assert len(behind) > 100
     shadow = (behind[:, 0] / behind[:, 2]).abs() < 0.1 / 2 - 0.01

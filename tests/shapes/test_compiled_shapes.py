@@ -8,9 +8,8 @@ from torch import nn
 from torch.export import Dim, export
 from torch.func import functional_call, jacfwd, jacrev, vmap
 
-from torchreg.registration.bones.grid_lbs import GridLBS
+import torchreg as tr
 from torchreg.registration.bones.sparse_grid import SparseGrid
-from torchreg.shapes.hand import Hand
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -23,12 +22,12 @@ new_torch = pytest.mark.skipif(
 class Distance(nn.Module):
     """The distance of points from a shape, as a layer."""
 
-    def __init__(self, shape):
+    def __init__(self, shape, pose):
         super().__init__()
-        self.shape = shape
+        self.shape, self.pose = shape, pose
 
-    def forward(self, points, pose):
-        return self.shape.distance(points, pose)
+    def forward(self, points):
+        return self.shape.distance(points, self.pose)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +47,7 @@ def grid_model(points, blend):
     transforms = torch.eye(4).repeat(3, 1, 1)
     transforms[:, :3, 3] = torch.randn(3, 3, generator=generator)
     weights = torch.randn(grid.num_corners, 3, generator=generator).softmax(-1)
-    return GridLBS(grid, weights, transforms, blend=blend).to(torch.float32)
+    return tr.GridLBS(grid, weights, transforms, blend=blend).to(torch.float32)
 
 
 def assert_same(found, expected):
@@ -61,22 +60,30 @@ def compiled(layer):
     return torch.compile(layer, fullgraph=True, backend="aot_eager")
 
 
-@pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
-def test_grids_are_compiled_as_one_graph(points, blend):
-    model = grid_model(points, blend)
-    torch.testing.assert_close(compiled(model)(points), model(points))
+def layers(hand, skin, points, poses, name):
+    """A layer with its input that has a first dimension of any size."""
+    if name in ("shape", "skin"):
+        return hand if name == "shape" else skin, poses
+    if name == "distance":
+        return Distance(hand, poses[0]), points
+    return grid_model(points, name), points
 
 
 @new_torch
-def test_skins_and_distances_are_compiled_as_one_graph(plain_hand, plain_hand_skin, points, poses):
-    torch.testing.assert_close(compiled(plain_hand_skin)(poses), plain_hand_skin(poses))
-    layer = Distance(plain_hand)
-    torch.testing.assert_close(compiled(layer)(points, poses[0]), layer(points, poses[0]))
+@pytest.mark.parametrize("name", ["linear", "dual_quaternion", "skin", "distance", "shape"])
+def test_layers_are_compiled_as_one_graph_and_exported_for_inputs_of_any_size(
+    plain_hand, plain_hand_skin, points, poses, name
+):
+    layer, inputs = layers(plain_hand, plain_hand_skin, points, poses, name)
+    assert_same(compiled(layer)(inputs), layer(inputs))
+    program = export(layer, (inputs,), dynamic_shapes=({0: Dim.AUTO},)).module()
+    for count in (len(inputs), len(inputs) - 1):
+        assert_same(program(inputs[:count]), layer(inputs[:count]))
 
 
 @new_torch
 def test_the_forward_pass_of_a_shape_is_compiled_as_one_graph_and_trained(poses):
-    hand = Hand().requires_grad_(True)
+    hand = tr.Hand().requires_grad_(True)
     outputs, gradients = [], []
     for layer in (compiled(hand), hand):
         hand.zero_grad()
@@ -85,13 +92,6 @@ def test_the_forward_pass_of_a_shape_is_compiled_as_one_graph_and_trained(poses)
         gradients.append([value.grad.clone() for value in hand.parameters()])
     assert_same(*outputs)
     torch.testing.assert_close(*gradients)
-
-
-@new_torch
-def test_exported_shapes_take_any_number_of_poses(plain_hand, poses):
-    program = export(plain_hand, (poses,), dynamic_shapes=({0: Dim.AUTO},)).module()
-    for count in (3, 2):
-        assert_same(program(poses[:count]), plain_hand(poses[:count]))
 
 
 def test_the_forward_pass_of_a_shape_is_mapped_and_differentiated(plain_hand, poses):
@@ -111,40 +111,6 @@ def test_the_forward_pass_of_a_shape_is_mapped_and_differentiated(plain_hand, po
     for row, pose in enumerate(poses):
         own = functional_call(plain_hand, {name: value[row] for name, value in states.items()}, (pose,))
         assert_same(tuple(field[row] for field in mapped), own)
-
-
-@pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
-def test_exported_grids_take_any_number_of_points(points, blend):
-    model = grid_model(points, blend)
-    program = export(model, (points,), dynamic_shapes={"points": {0: Dim.AUTO}}).module()
-    for count in (60, 41, 3):
-        torch.testing.assert_close(program(points[:count]), model(points[:count]))
-
-
-@new_torch
-def test_exported_skins_take_any_number_of_poses(plain_hand_skin, poses):
-    program = export(plain_hand_skin, (poses,), dynamic_shapes=({0: Dim.AUTO},)).module()
-    for count in (3, 2):
-        torch.testing.assert_close(program(poses[:count]), plain_hand_skin(poses[:count]))
-
-
-@new_torch
-def test_exported_distances_take_any_number_of_points(plain_hand, points, poses):
-    layer = Distance(plain_hand)
-    program = export(layer, (points, poses[0]), dynamic_shapes=({0: Dim.AUTO}, None)).module()
-    for count in (60, 41, 3):
-        torch.testing.assert_close(program(points[:count], poses[1]), layer(points[:count], poses[1]))
-
-
-def test_both_modes_give_the_same_derivatives(plain_hand, plain_hand_skin, points, poses):
-    torch.testing.assert_close(jacfwd(plain_hand_skin)(poses[0]), jacrev(plain_hand_skin)(poses[0]))
-    far = points + 0.3  # the exact zero set of max() is left out
-    one, other = (mode(plain_hand.distance, argnums=1)(far, poses[0]) for mode in (jacfwd, jacrev))
-    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
-    model = grid_model(points, "dual_quaternion")
-    inputs = (points[:10], model.transforms.detach())
-    one, other = (mode(model, argnums=1)(*inputs) for mode in (jacfwd, jacrev))
-    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
 def test_mapped_layers_are_batched_layers(plain_hand, plain_hand_skin, points, poses):

@@ -1,28 +1,18 @@
 """Limbs of hands, robots and odd trees."""
 
-import torch
-
+import torchreg as tr
+from tests.shapes.kinds import at
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.hand import Hand
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.primitives import Primitive
 
-ROD = Primitive("capsule", (0.1, 0.05), torch.eye(4, dtype=torch.float64))
+
+def limbs_of(joints, frames):
+    rod = Primitive("capsule", (0.1, 0.05), at())
+    return find_limbs(tr.ArticulatedShape(KinematicTree(tuple(joints)), frames, [rod] * len(frames), nu=0.01))
 
 
-def offset(x):
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[0, 3] = x
-    return pose
-
-
-def shape_of(joints, frames):
-    return ArticulatedShape(KinematicTree(tuple(joints)), frames, [ROD] * len(frames), nu=0.01)
-
-
-def test_the_limbs_of_a_hand_are_its_fingers():
-    hand = Hand()
+def test_the_limbs_of_a_hand_are_its_fingers(hand):
     limbs, trunk = find_limbs(hand)
     assert trunk == [0]
     assert [limb.parts for limb in limbs] == [[3 * finger + 1 + bone for bone in range(3)] for finger in range(5)]
@@ -34,13 +24,13 @@ def test_the_limbs_of_a_hand_are_its_fingers():
 
 def test_a_chain_is_one_limb_and_parts_that_move_as_one_are_one_body():
     joints = [
-        Joint("base", -1, offset(0.0)),
-        Joint("plate", 0, offset(0.1)),
-        Joint("arm", 0, offset(0.2), "revolute"),
-        Joint("cover", 2, offset(0.1)),
-        Joint("hand", 3, offset(0.3), "prismatic"),
+        Joint("base", -1, at(0.0)),
+        Joint("plate", 0, at(0.1)),
+        Joint("arm", 0, at(0.2), "revolute"),
+        Joint("cover", 2, at(0.1)),
+        Joint("hand", 3, at(0.3), "prismatic"),
     ]
-    limbs, trunk = find_limbs(shape_of(joints, ["base", "plate", "arm", "cover", "hand"]))
+    limbs, trunk = limbs_of(joints, ["base", "plate", "arm", "cover", "hand"])
     assert trunk == [0, 1]
     assert len(limbs) == 1
     assert [body.parts for body in limbs[0].bodies] == [(2, 3), (4,)]
@@ -49,31 +39,31 @@ def test_a_chain_is_one_limb_and_parts_that_move_as_one_are_one_body():
 
 def test_limbs_that_hang_on_limbs_come_after_them():
     joints = [
-        Joint("pelvis", -1, offset(0.0)),
-        Joint("spine", 0, offset(0.2), "revolute"),
-        Joint("leg", 0, offset(-0.2), "revolute"),
-        Joint("left", 1, offset(0.1), "revolute"),
-        Joint("right", 1, offset(0.2), "revolute"),
-        Joint("fist", 4, offset(0.2), "revolute"),
+        Joint("pelvis", -1, at(0.0)),
+        Joint("spine", 0, at(0.2), "revolute"),
+        Joint("leg", 0, at(-0.2), "revolute"),
+        Joint("left", 1, at(0.1), "revolute"),
+        Joint("right", 1, at(0.2), "revolute"),
+        Joint("fist", 4, at(0.2), "revolute"),
     ]
-    limbs, trunk = find_limbs(shape_of(joints, ["pelvis", "spine", "leg", "left", "right", "fist"]))
+    limbs, trunk = limbs_of(joints, ["pelvis", "spine", "leg", "left", "right", "fist"])
     assert trunk == [0]
     assert [(limb.parts, limb.level) for limb in limbs] == [([1], 0), ([2], 0), ([3], 1), ([4, 5], 1)]
 
 
 def test_a_mimic_joint_belongs_to_the_limb_that_it_follows():
     joints = [
-        Joint("palm", -1, offset(0.0)),
-        Joint("jaw", 0, offset(0.1), "prismatic", lower=0.0, upper=0.1),
-        Joint("other", 0, offset(-0.1), "prismatic", mimic=(1, -1.0, 0.0)),
+        Joint("palm", -1, at(0.0)),
+        Joint("jaw", 0, at(0.1), "prismatic", lower=0.0, upper=0.1),
+        Joint("other", 0, at(-0.1), "prismatic", mimic=(1, -1.0, 0.0)),
     ]
-    limbs, trunk = find_limbs(shape_of(joints, ["palm", "jaw", "other"]))
+    limbs, trunk = limbs_of(joints, ["palm", "jaw", "other"])
     assert [limb.dofs for limb in limbs] == [[6], []]
     assert trunk == [0]
 
 
 def test_a_moving_first_part_is_a_limb_of_the_base():
-    joints = [Joint("world", -1, offset(0.0)), Joint("arm", 0, offset(0.1), "revolute")]
-    limbs, trunk = find_limbs(shape_of(joints, ["arm"]))
+    joints = [Joint("world", -1, at(0.0)), Joint("arm", 0, at(0.1), "revolute")]
+    limbs, trunk = limbs_of(joints, ["arm"])
     assert trunk == []
     assert limbs[0].bodies[0].parent == -1

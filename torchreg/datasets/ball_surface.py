@@ -24,13 +24,9 @@ _PAINTING = _Painting()
 
 
 def bent_axes(along: Tensor, across: Tensor, elevations: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """Return axes (..., S, 3) of arms that begin at the origin and bend on the way, and their directions (..., S, 3).
+    """Return axes (..., S, 3) of arms that begin at the origin and bend, and their directions (..., S, 3).
 
-    Args:
-        along: (..., S) cosines of the azimuths at even steps along each axis.
-        across: (..., S) sines of the same.
-        elevations: (..., S) radians.
-        lengths: (...) of the axes.
+    Cosines and sines of the azimuths and the elevations (radians) are (..., S) at even steps along each axis.
     """
     flat = elevations.cos()
     directions = torch.stack((flat * along, flat * across, elevations.sin()), dim=-1)
@@ -42,15 +38,9 @@ def bent_axes(along: Tensor, across: Tensor, elevations: Tensor, lengths: Tensor
 def ball_surface(
     balls: Tensor, sizes: Tensor, resolution: int, noise: float, generator: torch.Generator, dtype: torch.dtype
 ) -> TriangleMesh:
-    """Return the surface around balls, meshed on a randomly shifted grid.
+    """Return the surface around balls with centers (N, 3) and radii (N,), meshed on a randomly shifted grid.
 
-    Args:
-        balls: (N, 3) their centers, float64.
-        sizes: (N,) their radii.
-        resolution: voxels along the longest side of the box.
-        noise: standard deviation of the field at each voxel, in voxels.
-        generator: of the shift and the noise.
-        dtype: of the mesh.
+    The noise of the field at each voxel is in voxels; the resolution is that of the longest side of the box.
     """
     lower, upper = (balls - sizes[:, None]).amin(0), (balls + sizes[:, None]).amax(0)
     spacing = float((upper - lower).max()) / resolution

@@ -27,17 +27,17 @@ class _Variety:
     margin: float = 0.25  # by which the box of outliers is larger than the shape, on each side
     clumped: float = 0.4  # of the clouds, in which outliers lie about one place
     clump: float = 0.1  # standard deviation about it
-    whole: float = 0.15  # of the clouds, seen from all sides
+    whole: float = 0.15  # of the clouds, measured from all sides
     stretch: float = 0.06  # standard deviation by which a thing differs from the shape along each axis
     forearm: float = 0.5  # of the clouds of hands
     forearm_length: tuple[float, float] = (0.2, 1.5)
     forearm_radius: tuple[float, float] = (0.09, 0.17)  # at the wrist
     forearm_growth: float = 0.15  # of the radius, along as much
     forearm_turn: float = 0.35  # standard deviation of its direction, about that from the hand's middle to the wrist
-    neighbor: float = 0.15  # of the clouds, another thing of the same shape beside the first
+    neighbor: float = 0.15  # of the clouds, a second object of the same shape next to the first
     neighbor_distance: tuple[float, float] = (0.3, 1.0)  # of the two
-    beside: tuple[float, float] = (0.1, 1.0)  # points of a forearm or of another thing for each of the first
-    beside_points: int = 600  # of which those are drawn
+    extra_points: tuple[float, float] = (0.1, 1.0)  # of a forearm or a second object for each of the first
+    extra_samples: int = 600  # of which those are drawn
     hole: float = 0.4  # of the clouds, with a ball without points
     hole_radius: tuple[float, float] = (0.05, 0.25)
     thinned: float = 0.5  # of the clouds, of which some points lack
@@ -55,13 +55,10 @@ _VARIETY = _Variety()
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch:
-    """Clouds of one shape, and the truth.
+    """Clouds (B, M, 3) of one shape about the origin, metres; the mask (B, M) is False for padding; and the truth.
 
     Args:
-        points: (B, M, 3), metres, the shape about the origin.
-        mask: (B, M), False where there is no point.
-        poses: (B, num_dofs).
-        index: (B, M) int64 point of the skin that was seen, -1 for outliers.
+        index: (B, M) int64 observed point of the skin, -1 for outliers.
     """
 
     points: Tensor
@@ -75,14 +72,6 @@ def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator
 
     Fingers of a hand curl together in half of the poses; all other joints move independently, each pose by up to a
     share of their ranges of its own.
-
-    Args:
-        shape: whose base can move.
-        count: of poses.
-        generator: on the device on which to draw.
-
-    Raises:
-        InputError: if the base cannot move.
     """
     check_count(count, "count", 1)
     if not bool(torch.isinf(shape.lower[:3]).all()):
@@ -115,23 +104,17 @@ def random_clouds(
 ) -> CloudBatch:
     """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, thinned or not.
 
-    The thing is not quite of the shape's proportions; a forearm is at some hands, and another thing beside some.
-
-    Args:
-        skin: many points of the surface, with normals.
-        size: of the shape, metres.
-        poses: (B, num_dofs), the shape about the origin.
-        num_points: of each cloud, at most.
-        generator: on the device of the skin.
+    The object's proportions differ a little from the shape's (size in metres); some hands have a forearm, and some
+    clouds a second object.
     """
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)
     draw = _Draw(generator, surface, size)
     forearm = _VARIETY.forearm if isinstance(skin.shape, Hand) else 0.0
     scene = draw.scene(surface, normals, poses[:, :3], forearm)
-    seen, slant = draw.visible(scene.points, scene.normals)
+    visible, slant = draw.visible(scene.points, scene.normals)
     whole = draw.uniform(len(poses), 1) < _VARIETY.whole
-    weight = scene.weight * torch.where(whole, 1.0, torch.where(seen, slant, 0.0))
+    weight = scene.weight * torch.where(whole, 1.0, torch.where(visible, slant, 0.0))
     # Without replacement, by the largest of the logarithms and Gumbel noise.
     ranks = weight.log() - draw.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
     score, index = ranks.topk(min(num_points, ranks.shape[1]), dim=1)
@@ -152,13 +135,7 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Draw:
-    """Draws what differs between clouds of a batch.
-
-    Args:
-        generator: of all numbers.
-        like: a tensor whose dtype and device the draws have.
-        size: of the shape, metres.
-    """
+    """Draws the differences between clouds of a batch, for a shape of a size in metres, like a tensor."""
 
     generator: torch.Generator
     like: Tensor
@@ -173,14 +150,7 @@ class _Draw:
         return (low + (high - low) * self.uniform(*size)).exp()
 
     def scene(self, surface: Tensor, normals: Tensor, base: Tensor, forearm: float) -> _Scene:
-        """Return a thing that differs a little from the shape, and what is beside it.
-
-        Args:
-            surface: (B, N, 3) of the shape.
-            normals: (B, N, 3).
-            base: (B, 3) its origin.
-            forearm: share of the clouds with one.
-        """
+        """Return an object that differs a little from the surface (B, N, 3), and its surroundings."""
         batch, count = surface.shape[:2]
         axes = rotation_from_quaternion(_normal((batch, 4), self.generator, self.like))
         scale = 1 + _VARIETY.stretch * _normal((batch, 3, 1), self.generator, self.like)
@@ -193,13 +163,13 @@ class _Draw:
             (_VARIETY.neighbor, self.neighbor(surface, normals)),
         ):
             there = self.uniform(batch, 1) < share
-            often = self.between(_VARIETY.beside, batch, 1) * count / points.shape[1]
+            often = self.between(_VARIETY.extra_points, batch, 1) * count / points.shape[1]
             parts.append((points, facing, torch.where(there, often, 0.0).expand(-1, points.shape[1])))
         return _Scene(*(torch.cat(part, dim=1) for part in zip(*parts, strict=True)))
 
     def forearm(self, base: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
         """Return oriented points (B, P, 3) of cones that begin at the base and lead away from the middle."""
-        batch, count = len(base), _VARIETY.beside_points
+        batch, count = len(base), _VARIETY.extra_samples
         axis = _unit(_unit(base - middle) + _VARIETY.forearm_turn * _normal((batch, 3), self.generator, self.like))
         axis = axis.unsqueeze(1)
         along = self.between(_VARIETY.forearm_length, batch, 1) * self.uniform(batch, count)
@@ -210,10 +180,10 @@ class _Draw:
         return base.unsqueeze(1) + self.size * offset, around
 
     def neighbor(self, surface: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        """Return oriented points (B, P, 3) of the next thing of the batch, beside each."""
+        """Return oriented points (B, P, 3) of the next object of the batch, next to each."""
         distance = self.size * self.between(_VARIETY.neighbor_distance, len(surface), 1, 1)
         offset = distance * _unit(_normal((len(surface), 1, 3), self.generator, self.like))
-        some = torch.linspace(0, surface.shape[1] - 1, _VARIETY.beside_points, device=surface.device).long()
+        some = torch.linspace(0, surface.shape[1] - 1, _VARIETY.extra_samples, device=surface.device).long()
         return surface[:, some].roll(1, 0) + offset, normals[:, some].roll(1, 0)
 
     def visible(self, surface: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,8 +37,6 @@ class CreatureForm:
     """The form of a creature and the amplitudes of its motion; lengths in shares of an arm's.
 
     Args:
-        num_arms: evenly around the body.
-        body: radius of the body.
         root: radius of an arm at the body.
         end: radius of an arm at its tip.
         sway: largest turn of an arm's end in the plane of the body, radians; all arms sway together by half of it.
@@ -69,7 +67,6 @@ class CreatureSequence:
     """A creature in T frames whose meshes are unrelated, and the truth; the length of an arm is about 1.
 
     Args:
-        meshes: T closed surfaces.
         tips: (T, K, 3) ends of the arms, on the surface.
         curves: (T, K, S, 3) axes of the arms, from the middle of the body to the middle of the last ball.
         radii: (K, S) of the arms around their axes.
@@ -97,20 +94,9 @@ def creature_sequence(
 ) -> CreatureSequence:
     """Return a creature that bends and sways its arms while it turns and drifts, meshed anew in every frame.
 
-    Args:
-        form: `STARFISH`, `OCTOPUS` or another.
-        num_frames: number of frames; half a cycle of swaying takes 12.
-        touching: whether arms 0 and 1 merge in the middle third of the sequence: ``"none"``; ``"flanks"`` side by
-            side, the tips apart; ``"tips"`` end to end.
-        noise: standard deviation of the field at each voxel, in voxels.
-        resolution: voxels along the longest side of the box.
-        dtype: of everything.
-        seed: of form, motion and noise.
-
-    Raises:
-        InputError: if an argument is out of range.
-
-    Cost: 0.15 s per frame at the default resolution on one CPU core.
+    In the middle third of the sequence arms 0 and 1 touch: "none", "flanks" (side by side, the tips apart) or "tips"
+    (end to end). The noise is the standard deviation of the field at each voxel, in voxels; the resolution counts
+    voxels along the longest side of the box.
     """
     check_count(num_frames, "num_frames", 1)
     check_choice(touching, "touching", TOUCHING)

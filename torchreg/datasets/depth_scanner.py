@@ -17,25 +17,14 @@ from torchreg.geometry.visibility import Raster, View, rasterize
 
 @dataclass(frozen=True, eq=False)
 class SurfaceScan:
-    """A range scan, and the true position of each of its points on the mesh.
-
-    Args:
-        scan: N points.
-        face: (N,) face of the mesh.
-        barycentric: (N, 3) float64 weights of its corners at the true, noiseless position.
-    """
+    """A range scan, and where its points truly lie on the mesh: face (N,) and barycentric weights (N, 3)."""
 
     scan: RangeScan
     face: Tensor
     barycentric: Tensor
 
     def transferred(self, values: Tensor, faces: Tensor) -> Tensor:
-        """Return values (N, C) at the points from values (V, C) at the vertices, such as positions or weights.
-
-        Args:
-            values: (V, C) in the dtype to be returned.
-            faces: (F, 3) of the mesh that was scanned.
-        """
+        """Return values (N, C) at the points from values (V, C) at the vertices of the scanned mesh, in their dtype."""
         return interpolate(values, faces, self.face, self.barycentric.to(values))
 
 
@@ -49,9 +38,6 @@ class DepthScanner:
         max_slant: no depth is measured where the ray meets the surface at more than this from its normal, radians.
         num_holes: round patches without data at random positions on the surface.
         hole_radius: of those, as a share of the diagonal of the mesh.
-
-    Raises:
-        InputError: if a number is out of range.
     """
 
     num_points: int = 4500
@@ -70,34 +56,16 @@ class DepthScanner:
         check_positive(self.hole_radius, "hole_radius", allow_zero=True)
 
     def view(self, mesh: TriangleMesh, reach: float) -> View:
-        """Return the camera and its pixels for all frames, chosen by the first one.
-
-        Args:
-            mesh: the first frame, before the camera.
-            reach: largest tangent of an angle to the axis of the camera within its picture.
-
-        Raises:
-            InputError: if the camera sees nothing of the mesh.
-        """
+        """Return camera and pixels for all frames, from the first; ``reach`` is the tangent of half the view."""
         check_positive(reach, "reach")
-        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side, to measure the area that is seen
-        seen = int(self._measurable(mesh, first)[1].sum())
-        if not seen:
+        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side, to measure the visible area
+        pixels = int(self._measurable(mesh, first)[1].sum())
+        if not pixels:
             raise InputError("mesh must lie before the camera, which looks along +z, and face it; it sees nothing")
-        return _centered_view(first.pitch * math.sqrt(seen / self.num_points), reach)
+        return _centered_view(first.pitch * math.sqrt(pixels / self.num_points), reach)
 
     def scan(self, mesh: TriangleMesh, view: View, generator: torch.Generator, dtype: torch.dtype) -> SurfaceScan:
-        """Return the camera's scan of a closed mesh.
-
-        Args:
-            mesh: faces outwards.
-            view: see `view`.
-            generator: of noise and holes.
-            dtype: of the scan.
-
-        Raises:
-            InputError: if the camera sees nothing of the mesh.
-        """
+        """Return the camera's scan of a closed mesh with faces outwards; InputError if it shows nothing of it."""
         raster, valid = self._measurable(mesh, view)
         pixel = valid.nonzero()
         row, column = pixel.unbind(-1)

@@ -19,13 +19,10 @@ SIDES = {"left": 1.0, "right": -1.0}  # signs of x
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a body in its rest pose.
+    """One part of a body in its rest pose, in the body's coordinates: metres, y up and z forward.
 
     Args:
-        name: unique in the body.
-        parent: name of the parent part, None for the root.
-        joint: position of the joint with the parent; for the root its own middle. Metres, y up and z forward.
-        solids: of the part, in the coordinates of the body.
+        joint: position of the joint with the parent; for the root its own middle.
     """
 
     name: str
@@ -36,14 +33,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A surface in its rest pose and its parts, which move it by linear blend skinning.
+    """A surface in its rest pose and its parts, which move it by linear blend skinning; metres, y up and z forward.
 
     Args:
-        mesh: the rest surface, metres, y up and z forward.
         weights: (V, P) rows sum to one.
         joints: (P, 3) joints of the parts with their parents, in the rest pose; for the root its own middle.
         parents: P indices, parents before children, -1 for the root.
-        part_names: P names.
     """
 
     mesh: TriangleMesh
@@ -64,12 +59,9 @@ class Figure:
         return self.part_names.index(name)
 
     def transforms(self, rotations: Tensor, base: Tensor | None = None) -> Tensor:
-        """Return the rigid motions (..., P, 4, 4) of all parts from the rest pose.
+        """Return the rigid motions (..., P, 4, 4) of all parts from the rest pose, followed by the motion of the base.
 
-        Args:
-            rotations: (..., P, 3, 3) of each part about its joint relative to its parent, in the axes of the rest
-                pose; the root turns about its own middle.
-            base: (..., 4, 4) motion of the figure after that; the identity by default.
+        Rotations (..., P, 3, 3) turn each part about its joint relative to its parent, in the axes of the rest pose.
         """
         joints = self.joints.to(rotations)
         about = joints - (rotations @ joints.unsqueeze(-1)).squeeze(-1)
@@ -96,17 +88,9 @@ def meshed_figure(
 ) -> Figure:
     """Return a body of rigid pieces, each with a closed surface, or of one closed, smoothly fused and skinned surface.
 
-    Weights of a skin are ``softmax(-d_p / softness)`` over the distances d_p to the parts in the rest pose, so that it
-    bends over about four times ``softness``; parts that must not fuse lie apart in the rest pose.
-
-    Args:
-        parts: parents before children.
-        spacing: of the mesh, metres.
-        blend: approximate radius of the seams of a skin, metres.
-        softness: length scale of its weights, metres; None leaves the pieces rigid.
-
-    Raises:
-        InputError: if a name is unknown or doubled, or a number is not positive.
+    Weights of a skin are ``softmax(-d_p / softness)`` over the distances d_p to the parts in the rest pose, metres;
+    None leaves the pieces rigid. Parts that must not fuse lie apart in the rest pose. ``blend`` is the approximate
+    radius of the seams, metres.
     """
     check_positive(spacing, "spacing")
     check_positive(blend, "blend", allow_zero=True)

@@ -53,14 +53,11 @@ _STAGE, _PERIODS = _Stage(), _Periods()
 
 @dataclass(frozen=True, eq=False)
 class HandCloud:
-    """A measured cloud and the truth behind it.
+    """A measured cloud in random order and the truth behind it.
 
     Args:
-        points: (M, 3), metres, in random order.
         inliers: (M,) bool, True for points of the shape.
         part_labels: (M,) int64 part of each point, -1 for outliers.
-        pose: (num_dofs,) the true pose.
-        keypoints: (K, 3) true positions of the shape's keypoints, metres.
         vertices: (V, 3) true positions of the vertices of the skin that was measured, metres.
         part_counts: (P,) int64 points on each part.
     """
@@ -84,15 +81,7 @@ def surface_skin(
 ) -> LinearBlendSkin:
     """Return the shape's whole surface as a skin with faces: the mesh of its file, else its fused surface at rest.
 
-    Args:
-        shape: the articulated shape.
-        spacing: edge length of the fused surface's grid, metres; see `ArticulatedShape.surface_mesh`.
-        sharpness: a of the bending skin; the shape's own by default.
-
-    Returns:
-        The skin, with faces: `shape.file_skin()` or a `BendingSkin`.
-
-    Cost: meshing takes about a second; keep the skin.
+    Meshing takes about a second; ``spacing`` (metres) is that of `ArticulatedShape.surface_mesh`.
     """
     if shape.surface is not None:
         return shape.file_skin()
@@ -172,20 +161,7 @@ def shuffled_cloud(
     outliers: Tensor,
     generator: torch.Generator,
 ) -> HandCloud:
-    """Return points of a shape and outliers as one cloud in random order, with the truth.
-
-    Args:
-        shape: the true shape.
-        pose: (num_dofs,) the true pose.
-        vertices: (V, 3) the posed surface.
-        surface: (N, 3) measured points of the shape.
-        labels: (N,) int64 parts of those.
-        outliers: (O, 3).
-        generator: of the order.
-
-    Returns:
-        The cloud of N + O points.
-    """
+    """Return N points of a shape, with their parts, and O outliers as one cloud in random order, with the truth."""
     order = torch.randperm(len(surface) + len(outliers), generator=generator, device=generator.device)
     order = order.to(surface.device)
     with torch.no_grad():
@@ -246,16 +222,7 @@ def random_hand_pose(
 
 
 def placed(shape: ArticulatedShape, pose: Tensor, target: Tensor) -> Tensor:
-    """Return the pose within its limits and with its base moved so that the middle of the parts lies at ``target``.
-
-    Args:
-        shape: the shape.
-        pose: (..., num_dofs).
-        target: (..., 3), metres.
-
-    Returns:
-        Poses (..., num_dofs); a base that cannot move stays in place.
-    """
+    """Return poses within limits, their base moved (if it can) so that the middle of the parts lies at the target."""
     pose = torch.maximum(torch.minimum(pose, shape.upper), shape.lower)
     still = torch.cat([torch.zeros_like(pose[..., :6]), pose[..., 6:]], dim=-1)
     with torch.no_grad():
@@ -283,9 +250,9 @@ def hand_motion(
     - "rotate": the fingers half bent, it turns around its own axis once in 5 s;
     - "rotation": the fingers slightly bent, it turns to and fro by 60 to 70 degrees about an axis that is parallel to
       the picture and at most 25 degrees from upright;
-    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together, seen
-      from the palm or from the back;
-    - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface seen before is hidden;
+    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together,
+      with the palm or the back to the camera;
+    - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface visible before is hidden;
       4 s later it turns back;
     - "fast": as "bending_palm", swaying more, 3 to 4 times as fast;
     - "occlusion": in 1.5 s, about 2 s after the start, it passes through the middle of the picture from one side to
@@ -414,12 +381,8 @@ def _curl_groups(shape: ArticulatedShape) -> Tensor:
 def curled_joints(hand: Hand, own: Tensor, finger: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
     """Return joint angles (..., 21) of a hand whose fingers curl, and spread so that they do not meet.
 
-    Args:
-        hand: the hand.
-        own: (..., 21) draw of each joint, 0 to 1.
-        finger: (..., 21) draws of which each finger takes one.
-        spread: (..., 21) draw of the abductions, -1 to 1.
-        bend: share of the way to their limits that joints move at most, 0 to 1; (..., 1) or one for all.
+    Draws are (..., 21): of each joint and of each finger from 0 to 1, of the abductions from -1 to 1. ``bend`` is the
+    share of the range that joints move at most, (..., 1) or one for all.
     """
     # One draw per finger, and a little of one per joint.
     return _hand_joints(hand, bend * (0.8 * finger[..., _curl_groups(hand)] + 0.2 * own), spread, bend)

@@ -20,12 +20,9 @@ _KIND, _STEM = "PoseLabel", "label_"
 
 @dataclass(frozen=True)
 class PoseLabel:
-    """One cloud and its pose.
+    """One cloud and its pose, metres and radians.
 
     Args:
-        points: (M, 3), metres.
-        pose: (num_dofs,), metres and radians.
-        keypoints: (K, 3), metres.
         parts: (M,) int64, the part of the shape that each point lies on, -1 for points off the surface.
         confidence: () from 0 to 1.
     """
@@ -44,11 +41,7 @@ class PoseLabel:
         )  # fmt: skip
 
     def save(self, folder: str | os.PathLike[str], number: int) -> Path:
-        """Write the label to a folder, as safetensors and JSON, and return the path; see `PoseLabels`.
-
-        Raises:
-            FileNotFoundError: if the folder does not exist.
-        """
+        """Write the label to a folder, as safetensors and JSON, and return the path; see `PoseLabels`."""
         path = label_path(folder, number)
         tensors = {item.name: getattr(self, item.name) for item in fields(self)}
         save_tensors(path, tensors, {"kind": _KIND, "confidence": float(self.confidence)})
@@ -61,17 +54,7 @@ def label_path(folder: str | os.PathLike[str], number: int) -> Path:
 
 
 class PoseLabels(Dataset[dict[str, Tensor]]):
-    """The labels in a folder, in the order of the frames, each a dict of the tensors of a `PoseLabel`.
-
-    Args:
-        folder: written by ``torchreg label``.
-        min_confidence: labels of less confidence are left out.
-        limits: on the size of each file.
-
-    Raises:
-        InputError: if the folder holds no label of that confidence.
-        FormatError: if a file is damaged or holds no label.
-    """
+    """The labels that ``torchreg label`` wrote to a folder, frame by frame, as dicts of tensors of a `PoseLabel`."""
 
     def __init__(
         self, folder: str | os.PathLike[str], *, min_confidence: float = 0.0, limits: FileLimits = DEFAULT_LIMITS
@@ -98,10 +81,7 @@ class PoseLabels(Dataset[dict[str, Tensor]]):
 
 
 def collate_labels(labels: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Return a batch of labels, clouds padded to the longest, with a ``mask`` (B, M) that is False for padding.
-
-    For the ``collate_fn`` of a `torch.utils.data.DataLoader`.
-    """
+    """Return a batch of labels, padded to the longest cloud, with a ``mask`` (B, M) that is False for padding."""
     longest = max(len(label["points"]) for label in labels)
 
     def padded(name: str, value: float) -> Tensor:

@@ -38,16 +38,11 @@ class ScanPair:
     """Two range scans of a figure in two poses, and the truth.
 
     Args:
-        source: the scan to be moved, N points.
-        target: the scan to be reached, M points.
         truth: (N, 3) true positions of the source's points in the target's pose, noiseless, visible or not.
         labels: (N,) int64 true part of each source point.
-        target_labels: (M,) the same of the target's points.
         joints: (J, 3) true joints in the source's pose, of each part but the root with its parent.
-        target_joints: (J, 3) the same in the target's pose.
         joint_parts: (J, 2) parts that meet at each joint, the parent first.
         transforms: (P, 4, 4) true motions of the parts from source to target.
-        part_names: P names.
         visible: (N,) bool, True where the target's camera sees the true position.
         missing: (N,) bool, True on parts that were taken off before the target was scanned.
     """
@@ -74,16 +69,11 @@ class ScanPair:
 class ScanSequence(Sequence[RangeScan]):
     """Frames of a moving figure, each scanned from one side on request, always with the same result.
 
-    ``sequence[t]`` is a `RangeScan` and ``sequence.pair(s, t)`` a `ScanPair`. The camera is at the origin and looks
-    along +z with -y up.
+    ``sequence[t]`` is a `RangeScan` and ``sequence.pair(s, t)`` a `ScanPair`.
 
     Args:
-        figure: the surface and its parts.
         transforms: (T, P, 4, 4) float64 motions of the parts from the rest pose to before the camera.
-        scanner: the camera.
         missing: per frame the number of a part that was taken off, -1 for none; empty where none ever is.
-        seed: of noise and holes.
-        dtype: of scans and truth.
     """
 
     figure: Figure
@@ -113,10 +103,7 @@ class ScanSequence(Sequence[RangeScan]):
         return TriangleMesh(self.figure.vertices(self.transforms[frame]), self.figure.mesh.faces)
 
     def scanned(self, frame: int) -> SurfaceScan:
-        """Return the scan of a frame, with the positions of its points on the mesh.
-
-        Cost: 0.05 s.
-        """
+        """Return the scan of a frame, with the positions of its points on the mesh."""
         frame = range(len(self))[frame]
         # Unlike generators of neighboring seeds, all draws of one generator are independent.
         seeds = torch.randint(2**62, (len(self),), generator=torch.Generator().manual_seed(self.seed))
@@ -127,10 +114,7 @@ class ScanSequence(Sequence[RangeScan]):
         return SurfaceScan(found.scan, present[found.face], found.barycentric)
 
     def pair(self, source: int, target: int) -> ScanPair:
-        """Return two frames with the truth.
-
-        Cost: 0.15 s.
-        """
+        """Return two frames with the truth."""
         return self._pair(source, target, self.scanned(source), self.scanned(target))
 
     def pairs(self, step: int = 1) -> Iterator[ScanPair]:
@@ -207,24 +191,9 @@ def jointed_toy(
 ) -> ScanSequence:
     """Return scans of a toy whose joints are turned at random from frame to frame before a depth camera.
 
-    Args:
-        frames: number of frames.
-        seed: of poses, views and noise.
-        toy: a `robot` by default.
-        step: largest change of a joint angle between adjacent frames, radians.
-        turn: largest rotation of the toy about its vertical between adjacent frames, radians; it is also tilted by up
-            to 30 degrees.
-        missing: whether a part without children, drawn anew each time, is taken off in every second frame, so that one
-            scan of each adjacent pair lacks it.
-        scanner: the camera; `DepthScanner` by default, 4,500 points.
-        dtype: of scans and truth.
-
-    References: Chang and Zwicker 2009, figure 9: an arm is missing.
-
-    Raises:
-        InputError: if a number is out of range.
-
-    Cost: 1 s for the toy, 0.03 s a frame.
+    Between adjacent frames joints turn by at most ``step`` and the toy about its vertical by at most ``turn``, radians;
+    it is also tilted by up to 30 degrees. With ``missing`` a part without children, drawn anew each time, is taken off
+    in every second frame (Chang and Zwicker 2009, figure 9).
     """
     check_count(frames, "frames", 2)
     check_positive(turn, "turn", allow_zero=True)

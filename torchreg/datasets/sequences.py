@@ -96,21 +96,7 @@ def range_clouds(
 ) -> list[HandCloud]:
     """Return the clouds of a shape in given poses, as a range camera or an all-round scanner sees it, with the truth.
 
-    Args:
-        shape: the true shape.
-        poses: (T, num_dofs) true poses; those of `hand_motion` pass before a camera at ``torch.zeros(3)``.
-        num_points: see `make_hand_cloud`.
-        noise: see `make_hand_cloud`.
-        outlier_ratio: see `make_hand_cloud`.
-        camera: (3,) see `make_hand_cloud`; None measures on all sides.
-        skin: see `make_hand_cloud`; made once for all poses.
-        seed: of the measurements.
-
-    Returns:
-        Clouds, one per pose.
-
-    Raises:
-        InputError: if an argument is out of range.
+    See `make_hand_cloud` for the arguments; poses (T, num_dofs) of `hand_motion` pass before a camera at zeros (3,).
     """
     check_shape(shape.check_pose(poses, "poses"), "poses", ("T", shape.num_dofs))
     skin, generator = surface_skin(shape) if skin is None else skin, torch.Generator().manual_seed(seed)

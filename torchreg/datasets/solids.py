@@ -18,14 +18,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RoundCone:
-    """A ball that moves along a segment while its radius changes; a sphere if the segment has no length.
-
-    Args:
-        start: center of the first ball.
-        end: center of the last ball.
-        start_radius: of the first ball, same unit.
-        end_radius: of the last ball.
-    """
+    """A ball that moves along a segment while its radius changes; a sphere if the segment has no length."""
 
     start: Vector
     end: Vector
@@ -51,13 +44,7 @@ class RoundCone:
 
 @dataclass(frozen=True)
 class RoundBox:
-    """A box along the axes with rounded edges.
-
-    Args:
-        center: its middle.
-        half: half of its sides, rounding included.
-        radius: of the edges, at most the shortest half side.
-    """
+    """A box along the axes with rounded edges; ``half`` of its sides includes the rounding."""
 
     center: Vector
     half: Vector
@@ -87,27 +74,13 @@ class Solid(Protocol):
 
 
 def union_distance(solids: Sequence[Solid], points: Tensor, blend: float) -> Tensor:
-    """Return signed distances (N,) to a union with rounded seams: ``-b log sum_i exp(-d_i / b)``.
-
-    Args:
-        solids: at least one.
-        points: (N, 3).
-        blend: b, the approximate radius of the seams, same unit; zero for a sharp union.
-
-    Differentiable: in ``points``, almost everywhere.
-    """
+    """Return signed distances (N,) to a union with seams of radius b, ``-b log sum_i exp(-d_i / b)``; 0: sharp."""
     distances = torch.stack([solid.distance(points) for solid in solids])
     return distances.amin(0) if blend == 0 else -blend * torch.logsumexp(-distances / blend, dim=0)
 
 
 def mesh_of(solids: Sequence[Solid], spacing: float, blend: float = 0.0) -> TriangleMesh:
-    """Return the closed surface of a union of solids, facing outwards, in float64.
-
-    Args:
-        solids: at least one.
-        spacing: edge length of the grid on which the surface is found, same unit.
-        blend: see `union_distance`.
-    """
+    """Return the closed surface of a union of solids, facing outwards, in float64, found on a grid of some spacing."""
     corners = [torch.tensor(corner, dtype=torch.float64) for solid in solids for corner in solid.bounds()]
     lower, upper = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
     # A smooth union is a little larger than its solids.

@@ -121,31 +121,14 @@ def stereo_clouds(
     obstacle: TriangleMesh | None = None,
     seed: int = 0,
 ) -> list[HandCloud]:
-    """Return stereo measurements of a shape in given poses, one cloud per pose, with the exact truth.
+    """Return stereo measurements of a shape in poses (T, num_dofs), one cloud per pose, with the exact truth.
 
-    Points lie at pixels of the left picture whose surface the right camera sees too, drawn uniformly from them. Four
-    tenths of the outliers lie on a forearm behind the wrist, where the shape is a hand and as far as it is seen, three
-    tenths on a wall behind the shape, the rest uniformly in the working volume: the box of all frames, slightly grown.
-    An obstacle hides surfaces behind it and adds outliers, 8 % as dense as the points of the shape.
-
-    Args:
-        shape: the true shape.
-        poses: (T, num_dofs) true poses, before the cameras.
-        stereo: the cameras and their noise; `StereoView` by default.
-        skin: of the true surface, with faces that look outwards; by default `surface_skin`.
-        num_points: points on the shape in the frame that shows most of it; the other frames have fewer, in proportion
-            to the pixels that both cameras see.
-        outlier_ratio: outliers as a share of all points in that frame, at least 0 and below 1; every frame has the
-            same number. Points on an obstacle come on top.
-        obstacle: a still mesh, faces outwards, metres.
-        seed: of forearm, wall and measurements.
-
-    Returns:
-        T clouds, in the shape's dtype and on its device; those of frames that hide the shape hold outliers alone.
-
-    Raises:
-        InputError: if an argument is out of range, the skin has no faces, a surface reaches behind the cameras or no
-            frame shows the shape.
+    Points lie at pixels of the left picture whose surface the right camera sees too, drawn uniformly from them:
+    ``num_points`` in the frame that shows most of the shape, in others fewer in proportion. ``outlier_ratio`` is the
+    share of outliers in that frame; every frame has as many. Four tenths of them lie on a forearm behind the wrist,
+    where the shape is a hand and as far as it is visible, three tenths on a wall behind the shape, the rest uniformly
+    in the working volume: the box of all frames, slightly grown. An obstacle, a still mesh, hides surfaces behind it
+    and adds outliers, 8 % as dense as the points of the shape.
     """
     poses = shape.check_pose(poses, "poses").detach()
     check_shape(poses, "poses", ("T", shape.num_dofs))
@@ -176,9 +159,6 @@ class _StereoScene:
     """All surfaces before the cameras: the shape, its forearm if it is a hand, an obstacle, a wall.
 
     Args:
-        shape: the true shape.
-        skin: its surface.
-        poses: (T, num_dofs).
         surface: (T, V, 3) vertices of the skin.
         others: (T, W, 3) vertices of forearm and obstacle.
         faces: (F, 3) of the skin, the forearm and the obstacle.
@@ -250,11 +230,11 @@ def _forearm(hand: Hand, bend: Tensor) -> TriangleMesh:
 
 
 def tube(rings: Tensor) -> TriangleMesh:
-    """Return the open tube through rings (R, S, 3); it faces outwards where they run clockwise seen from the next."""
+    """Return the open tube through rings (R, S, 3); it faces outwards where they run clockwise from the next."""
     levels, sides = rings.shape[:2]
     corner = torch.arange(levels - 1).unsqueeze(-1) * sides + torch.arange(sides)
-    beside = corner.roll(-1, dims=1)
-    quads = torch.stack([corner, corner + sides, beside + sides, beside], dim=-1).flatten(0, 1)
+    following = corner.roll(-1, dims=1)
+    quads = torch.stack([corner, corner + sides, following + sides, following], dim=-1).flatten(0, 1)
     return TriangleMesh(rings.flatten(0, 1), torch.cat([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
 
 
@@ -265,9 +245,6 @@ class _VisiblePoints:
     Args:
         counts: pixels that show each owner.
         points: (N, 3) float64 each, without noise.
-        face: (N,) each.
-        barycentric: (N, 3) each.
-        wall: (N, 3) points on the wall.
     """
 
     counts: list[int]
@@ -324,9 +301,9 @@ def _wall_points(
     down = (row + 0.5 - stereo.height / 2) / stereo.focal
     depth = (wall[0] - wall[1] * stereo.baseline / 2) / (1 - wall[1] * along - wall[2] * down)
     right_column = (column + 0.5 - stereo.focal * stereo.baseline / depth).floor().long()
-    seen = (right_column >= 0) & torch.isinf(right.depth[row, right_column.clamp(min=0)])
+    visible = (right_column >= 0) & torch.isinf(right.depth[row, right_column.clamp(min=0)])
     points = torch.stack([along * depth - stereo.baseline / 2, down * depth, depth], dim=-1)
-    return points[seen][:count]
+    return points[visible][:count]
 
 
 def _measured_cloud(

@@ -31,14 +31,7 @@ _COLLISIONS = _CollisionTest()
 
 @dataclass(frozen=True)
 class Hinge:
-    """An axis about which a part turns; a part with several hinges turns about the last one first.
-
-    Args:
-        part: name of the part that turns relative to its parent, about its joint.
-        axis: unit vector in the rest pose.
-        lower: least angle, radians.
-        upper: largest angle.
-    """
+    """An axis about which a part turns in its parent, radians; of several hinges the last one comes first."""
 
     part: str
     axis: Vector
@@ -48,13 +41,7 @@ class Hinge:
 
 @dataclass(frozen=True, eq=False)
 class Toy:
-    """Rigid pieces and the hinges between them.
-
-    Args:
-        figure: the pieces.
-        parts: the same as solids, to test for collisions.
-        hinges: H axes.
-    """
+    """Rigid pieces, the same as solids to test for collisions, and the hinges between them."""
 
     figure: Figure
     parts: tuple[Part, ...]
@@ -71,11 +58,7 @@ class Toy:
         return torch.stack(turns, dim=-3)
 
     def overlap(self, angles: Tensor) -> float:
-        """Return the largest penetration of parts that do not meet, metres; zero if none collide.
-
-        Args:
-            angles: (H,) of one pose.
-        """
+        """Return the largest penetration of parts that do not meet, metres; zero if none collide."""
         transforms = self.figure.transforms(self.rotations(angles.double()))
         sample = slice(None, None, max(1, self.figure.mesh.num_vertices // _COLLISIONS.num_vertices))
         vertices, owner = self.figure.vertices(transforms)[sample], self.figure.weights[sample].argmax(-1)
@@ -93,14 +76,6 @@ class Toy:
         """Return angles (frames, H) of poses in which all hinges turn by up to ``step`` from one to the next.
 
         Poses in which parts run into each other are drawn again.
-
-        Args:
-            frames: number of poses.
-            step: largest change of an angle, radians; changes are drawn evenly from plus and minus that.
-            generator: source of randomness; None draws from a fresh generator with seed 0.
-
-        Raises:
-            InputError: if a number is out of range, or no pose without overlap was found.
         """
         check_count(frames, "frames", 1)
         check_positive(step, "step", allow_zero=True)
@@ -127,13 +102,7 @@ class Toy:
 
 
 def robot(*, spacing: float = 0.008) -> Toy:
-    """Return a robot of 8 parts and 53 cm: body, head, and on each side upper arm, forearm and leg.
-
-    Args:
-        spacing: of the mesh, metres.
-
-    Cost: 0.5 s.
-    """
+    """Return a robot of 8 parts and 53 cm: body, head, and on each side upper arm, forearm and leg."""
     body = (
         RoundBox((0, 0.3, 0), (0.07, 0.09, 0.045), 0.012),
         RoundBox((0.02, 0.325, 0.045), (0.03, 0.03, 0.012), 0.006),

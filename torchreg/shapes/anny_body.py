@@ -51,19 +51,13 @@ class Phenotypes(Features):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, coefficients: Tensor) -> Tensor:
-        """Return the features (..., L) of coefficients (..., K).
-
-        Differentiable: in the coefficients; at an anchor the slope is the mean of those beside it.
-        """
+        """Return the features (..., L) of coefficients (..., K); at an anchor the slope is the mean of both sides."""
         hats = [_hats(coefficients[..., k], self.get_buffer(f"anchors_{k}")) for k in range(self.count)]
         values = torch.cat([*hats, self.fixed.expand(*coefficients.shape[:-1], -1)], dim=-1).unsqueeze(-2)
         return (values * self.mask + (1 - self.mask)).prod(-1) @ self.projection
 
     def jacobian(self, coefficients: Tensor) -> Tensor:
-        """Return the derivatives (..., L, K) of the features by coefficients (..., K).
-
-        A weight is a product of one hat of each phenotype at most; its derivative has the slope of one of them.
-        """
+        """Return the derivatives (..., L, K) of the features with respect to coefficients (..., K)."""
         anchors = [self.get_buffer(f"anchors_{k}") for k in range(self.count)]
         masks = self.mask.split([*(len(values) for values in anchors), len(self.fixed)], dim=-1)
         constant = (self.fixed * masks[-1] + (1 - masks[-1])).prod(-1)
@@ -87,7 +81,7 @@ def _hats(value: Tensor, anchors: Tensor) -> Tensor:
 
 
 def _hat_slopes(value: Tensor, anchors: Tensor) -> Tensor:
-    """Return the slopes of `_hats` (..., A) at values (...), at an anchor the mean of those beside it."""
+    """Return the slopes of `_hats` (..., A) at values (...), at an anchor the mean of both sides."""
     share = (value.unsqueeze(-1) - anchors[:-1]) / anchors.diff()
     inside = torch.heaviside(share, share.new_tensor(0.5)) * torch.heaviside(1 - share, share.new_tensor(0.5))
     slope = inside / anchors.diff()
@@ -96,14 +90,7 @@ def _hat_slopes(value: Tensor, anchors: Tensor) -> Tensor:
 
 
 def load_anny(kind: str) -> tuple[ShapeSpec, LinearSpace]:
-    """Return the rig of a kind of `KINDS` at its mean coefficients, and the space of its rest states.
-
-    What anny builds is kept in its cache folder, so that it need not even be imported again.
-
-    Raises:
-        InputError: if the kind is unknown.
-        MissingExtraError: if anny is not installed.
-    """
+    """Return the rig of a kind of `KINDS` at its mean coefficients, and the space of its rest states."""
     check_choice(kind, "kind", KINDS)
     try:
         version = metadata.version("anny")

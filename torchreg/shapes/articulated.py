@@ -89,7 +89,7 @@ class ArticulatedShape(Articulation):
 
         Args:
             path: the URDF file.
-            package_dirs: folders in which meshes are looked up, beside the file's folder and those above.
+            package_dirs: folders in which meshes are looked up, besides the file's folder and those above.
             primitive: "auto" (the file's own solids, and for meshes the kind nearest to them) or the kind fitted to
                 every link.
             meshes: what becomes of mesh files that are missing or need a reader that is not installed: "warn" leaves
@@ -229,7 +229,7 @@ class ArticulatedShape(Articulation):
             limits: see `from_gltf`.
             shape_dirs: (V, 3, K) metres per unit of each coefficient; or a function of coefficients (..., K), named by
                 ``coefficient_names``, that returns vertices (..., V, 3) and joints (..., J, 3), whose mean is at zero.
-            joint_dirs: (J, 3, K), beside ``shape_dirs``.
+            joint_dirs: (J, 3, K), with ``shape_dirs``.
             joint_regressor: (J, V), in place of ``joint_dirs``.
             coefficient_names: K names; "shape_0", ... by default.
             coefficient_std: standard deviation of the coefficients' prior about zero, one number or (K,); a fit keeps

@@ -57,10 +57,7 @@ _MESHES: dict[tuple[object, ...], TriangleMesh] = {}
 
 
 class Articulation(PosedTree):
-    """Parts on a kinematic tree and their fused surface, in any pose: the basis of skins and of shapes from files.
-
-    See `ArticulatedShape`, which is made from files as well, for conventions, arguments and parameters.
-    """
+    """Parts on a kinematic tree and their fused surface; `ArticulatedShape` explains conventions and arguments."""
 
     _started: Tensor
 
@@ -158,20 +155,14 @@ class Articulation(PosedTree):
         return self.surface.faces.to(self.rest.device)
 
     def fusion_length(self) -> Tensor:
-        """Return nu (), float64, metres.
-
-        Differentiable: in `log_nu`.
-        """
+        """Return nu (), float64, metres, with the gradient of `log_nu`."""
         held = self._held()
         if held is not None:
             return held.fusion_length
         return (self.log_nu - self._started[0]).double().exp() * self.start_nu
 
     def bending_sharpness(self) -> Tensor:
-        """Return the sharpness of the bending skin (), float64.
-
-        Differentiable: in `log_sharpness`.
-        """
+        """Return the sharpness of the bending skin (), float64, with the gradient of `log_sharpness`."""
         return (self.log_sharpness - self._started[1]).double().exp() * self.start_sharpness
 
     def forward(self, pose: Tensor) -> ShapeOutput:
@@ -217,10 +208,7 @@ class Articulation(PosedTree):
 
     @contextmanager
     def held_sizes(self) -> Iterator[None]:
-        """Evaluate bone lengths and radii once, not for every pose, in a ``with`` block; they must not change in it.
-
-        Poses of few points take a fifth less time.
-        """
+        """Evaluate bone lengths and radii once, not for every pose, in a ``with`` block; they must not change in it."""
         held = _HeldSizes(self, self._offset_scales(), self._scaled_sizes(), self._solid_poses(), self.fusion_length())
         token = _HELD.set(held)
         try:
@@ -243,18 +231,7 @@ class Articulation(PosedTree):
         return self.placed_distances(points, self.part_transforms(pose)).mT
 
     def placed_distances(self, points: Tensor, transforms: Tensor, parts: Sequence[int] | None = None) -> Tensor:
-        """Return the distance of points to the solids of parts under any part transforms, whatever the joints allow.
-
-        Args:
-            points: (..., N, 3), metres.
-            transforms: (..., P, 4, 4) ``T_world_part``, of the parts in ``parts``.
-            parts: indices of the parts; all by default.
-
-        Returns:
-            Distances (..., P, N), metres, negative inside.
-
-        Differentiable: in all.
-        """
+        """Return distances (..., P, N), metres, of points (..., N, 3) to parts under any transforms (..., P, 4, 4)."""
         local = self._local_planes(points, self._solid_frames(transforms, parts))
         return self.primitives.plane_distance(local, self._scaled_sizes(), parts)
 
@@ -287,18 +264,7 @@ class Articulation(PosedTree):
         ]
 
     def distances_without(self, points: Tensor, pose: Tensor, left_out: Sequence[Sequence[int]]) -> Tensor:
-        """Return the distance of points to the surface fused without some parts, for each of some sets of parts.
-
-        Args:
-            points: (..., N, 3), metres.
-            pose: (..., num_dofs).
-            left_out: L sets of indices of parts.
-
-        Returns:
-            Distances (L, ..., N), metres, negative inside; infinite where all parts are left out.
-
-        Differentiable: as `distance`.
-        """
+        """Return distances (L, ..., N) to the surface fused without L sets of parts each; infinite if none is left."""
         each = self.part_distances(points, pose)
         gone = torch.zeros(len(left_out), each.shape[-1], dtype=torch.bool, device=each.device)
         for row, parts in zip(gone, left_out, strict=True):

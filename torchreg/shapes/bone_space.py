@@ -25,15 +25,9 @@ BONE_PRIOR = BonePrior()
 
 
 def bone_space(shape: Articulation, surface: RigSurface) -> LinearSpace:
-    """Return the space in which a rig grows as a whole, in girth, and part by part in length and radius.
+    """Return the space of relative changes of a rig's size and girth and of its parts' lengths and radii.
 
-    Coefficients are relative changes: size, girth, then the length and the radius of each part. Lengths move the joints
-    that a part carries along, and stretch its vertices along its bone; radii stretch them across it. By how much parts
-    differ from the whole is not known beforehand: a scaled figure's do not, another person's do.
-
-    Args:
-        shape: the rig.
-        surface: of the rig.
+    Lengths move the joints of a part's children and stretch its vertices along its bone, radii across it.
     """
     frames = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
     index = shape.part_index

@@ -20,15 +20,12 @@ _Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class _Finger:
-    """Proportions of a finger of a right hand; x: thumb side, y: back, z: to the tips.
+    """Proportions of a finger of a right hand at rest; x: thumb side, y: back, z: to the tips.
 
     Args:
-        base_mm: position of the base joint.
         lengths_mm: of the phalanges, from the base to the tip.
         radii_mm: of the phalanges, across.
-        direction: from the base to the tip at rest.
-        dorsal: direction of the finger's back at rest.
-        segments: names of the phalanges.
+        dorsal: direction of the finger's back.
         joints: names of the joints, each with its motions and their limits in degrees.
         overlap: factor on the lengths of inner phalanges' ellipsoids, so that neighbors overlap and fuse smoothly.
     """
@@ -164,16 +161,7 @@ class Hand(ArticulatedShape):
         return float((points - points[0]).norm(dim=-1).max())
 
     def placed_keypoints(self, transforms: Tensor) -> Tensor:
-        """Return 21 keypoints: wrist, then thumb to little finger, each from its base joint to its tip.
-
-        Args:
-            transforms: (..., 16, 4, 4) ``T_world_part``.
-
-        Returns:
-            (..., 21, 3), metres, as `keypoints`.
-
-        Differentiable: in ``transforms`` and the bone lengths.
-        """
+        """Return 21 keypoints (..., 21, 3), metres: wrist, then thumb to little finger, each from base to tip."""
         origins = transforms[..., :3, 3]
         distal = list(self.fingertip_parts)
         tips = origins[..., distal, :] + transforms[..., distal, :3, 2] * self.bone_lengths[distal].unsqueeze(-1)

@@ -26,16 +26,8 @@ _MAX_DEPTH = 300
 class ForwardKinematics(nn.Module):
     """Maps joint values to frame transforms, for any number of leading batch dimensions.
 
-    Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. Frames are as those of
-    pytorch-kinematics, in a third of its time: the transform of a frame in its parent is linear in sine, cosine
-    and value of its joint, and each round of products doubles the number of generations between a frame and the
-    ancestor that it is given in.
-
-    Args:
-        tree: the kinematic tree.
-
-    Raises:
-        ModelError: if the tree is deeper than 300 frames.
+    A frame's transform in its parent is linear in sine, cosine and value of its joint; each round of products doubles
+    the number of generations between a frame and the ancestor that it is given in (Hillis and Steele 1986).
     """
 
     axes: Tensor
@@ -94,22 +86,7 @@ class ForwardKinematics(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, joint_values: Tensor, offset_scales: Tensor | None = None) -> Tensor:
-        """Return the transform of every frame in the coordinates of the tree's root.
-
-        Args:
-            joint_values: (..., num_dofs), radians or metres.
-            offset_scales: (F,) factors on the length of each frame's offset from its parent; ones by default.
-
-        Returns:
-            (..., F, 4, 4), ``T_root_frame``.
-
-        Raises:
-            InputError: if the number of joint values is not the number of degrees of freedom.
-
-        Differentiable: in both arguments, to any order.
-
-        References: Rodrigues 1840 for the rotation about an axis; Hillis and Steele 1986 for the doubling.
-        """
+        """Return ``T_root_frame`` (..., F, 4, 4) of joint values (..., num_dofs), with offsets scaled by (F,)."""
         check_shape(joint_values, "joint_values", (self.num_dofs,), batch=True)
         frames = self._local(joint_values, offset_scales).index_select(-3, self.by_depth)
         for number, complete in enumerate(self._complete):
@@ -136,22 +113,7 @@ class ForwardKinematics(nn.Module):
         return local.view(*local.shape[:-1], 4, 4)
 
     def joint_twists(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the twists of the moving joints, and the frames that they move.
-
-        A joint k moves a point x of a frame below it by ``linear_k + angular_k x x`` per unit.
-
-        Args:
-            frames: (..., F, 4, 4) frame transforms, in the coordinates of the twists.
-
-        Returns:
-            Twists (..., J, 6) of the moving joints (translation, rotation), and the matrix (F, J) of zeros and ones of
-            the frames they move. `couplings` (J, num_dofs) maps moving joints to degrees of freedom; without mimic
-            joints it is the identity.
-
-        Differentiable: in ``frames``.
-
-        References: Murray, Li, Sastry 1994, the spatial manipulator Jacobian.
-        """
+        """Return the twists (..., J, 6) of moving joints, (translation, rotation), and the frames (F, J) they move."""
         joints = frames.index_select(-3, self.joint_frames)[..., :3, :]
         rotation = joints[..., :3]
         angular = (rotation @ self.rotation_axes).squeeze(-1)
@@ -162,13 +124,7 @@ class ForwardKinematics(nn.Module):
 
 
 def build_chain(tree: KinematicTree, names: Sequence[str], offsets: Tensor) -> Chain:
-    """Return a tree as a `pytorch_kinematics.Chain`; a joint that mimics another moves by itself there.
-
-    Args:
-        tree: the kinematic tree, whose joints keep their names.
-        names: of the frames, all different; line breaks at their ends, which pytorch-kinematics drops, are left out.
-        offsets: (F, 4, 4) of the frames from their parents; the chain has their dtype and device.
-    """
+    """Return a tree as a `pytorch_kinematics.Chain`, in dtype and device of the offsets; mimics move by themselves."""
     import pytorch_kinematics as pk
 
     kind = {"dtype": offsets.dtype, "device": offsets.device}
@@ -188,18 +144,7 @@ def build_chain(tree: KinematicTree, names: Sequence[str], offsets: Tensor) -> C
 
 
 def read_chain(chain: Chain) -> tuple[UrdfRecord, frozenset[int]]:
-    """Return the tree and the solids of a `pytorch_kinematics.Chain`, in float64, depth first as its joint values.
-
-    Args:
-        chain: as pytorch-kinematics builds it from a URDF, SDF or MJCF file, or as built by hand.
-
-    Returns:
-        The record, without meshes, and the links with geometry that the chain only names: meshes, kinds not known.
-
-    Raises:
-        InputTypeError: if it is no such chain.
-        ModelError: if a joint is neither fixed nor revolute nor prismatic, names are doubled or numbers not finite.
-    """
+    """Return the record (without meshes) of a chain, and the links whose geometry it only names; depth first."""
     import pytorch_kinematics as pk
 
     if not isinstance(chain, pk.Chain):
@@ -284,12 +229,7 @@ def _new_name(name: str, taken: set[str]) -> str:
 
 
 def part_parents(tree: KinematicTree, frames: Sequence[int]) -> list[int]:
-    """Return, per part, the next part above it in the tree, -1 for none.
-
-    Args:
-        tree: the kinematic tree.
-        frames: index of each part's frame.
-    """
+    """Return, per part, the next part above its frame in the tree, -1 for none."""
     part_of = {frame: part for part, frame in enumerate(frames)}
     parents = []
     for frame in frames:
@@ -301,11 +241,7 @@ def part_parents(tree: KinematicTree, frames: Sequence[int]) -> list[int]:
 
 
 def neighbor_matrix(parents: Sequence[int]) -> Tensor:
-    """Return (P, P) booleans: True for each part itself, its parent and its children.
-
-    Args:
-        parents: parent of each part, -1 for none.
-    """
+    """Return (P, P) booleans: True for each part itself, its parent and its children."""
     neighbors = torch.eye(len(parents), dtype=torch.bool)
     for part, parent in enumerate(parents):
         if parent >= 0:
@@ -314,12 +250,7 @@ def neighbor_matrix(parents: Sequence[int]) -> Tensor:
 
 
 def offset_owners(tree: KinematicTree, frames: Sequence[int]) -> list[int]:
-    """Return, per frame of the tree, 1 + the part whose length scales its offset, or 0: the nearest part above it.
-
-    Args:
-        tree: the kinematic tree.
-        frames: index of each part's frame.
-    """
+    """Return, per frame of the tree, 1 + the part whose length scales its offset, or 0: the nearest part above it."""
     part_of = {frame: part for part, frame in enumerate(frames)}
     owners = []
     for joint in tree.joints:
@@ -344,10 +275,7 @@ def _axis_of(joint: Joint) -> Tensor:
 
 
 def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute: Tensor) -> dict[str, Tensor]:
-    """Return tables (F, 16) whose sum, weighted by 1, scale, sine, cosine and value, is a frame's pose in its parent.
-
-    A rotation about a unit axis a is ``a a^T + cos (I - a a^T) + sin [a]x``.
-    """
+    """Return tables (F, 16) whose sum, weighted by 1, scale, sine, cosine and value, is a pose in the parent."""
     motions = {name: torch.zeros(len(offsets), 4, 4, dtype=torch.float64) for name in ("sines", "cosines", "slides")}
     along = axes.unsqueeze(-1) * axes.unsqueeze(-2)
     revolute = is_revolute[:, None, None]
@@ -362,11 +290,7 @@ def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute:
 
 
 def _doubling(tree: KinematicTree) -> tuple[Tensor, Tensor, list[int], list[Tensor]]:
-    """Return the order of frames by depth, its inverse, and per round of products the number of complete frames.
-
-    In a round every incomplete frame is multiplied with the product that its next ancestor holds so far; the indices of
-    these ancestors in the order come last.
-    """
+    """Return the order of frames by depth, its inverse, and per round the number of complete frames and ancestors."""
     depths: list[int] = []
     for joint in tree.joints:
         depths.append(0 if joint.parent < 0 else depths[joint.parent] + 1)

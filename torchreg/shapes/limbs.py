@@ -12,13 +12,7 @@ from torchreg.shapes.articulation import Articulation
 
 @dataclass(frozen=True)
 class Body:
-    """Parts that no joint separates.
-
-    Args:
-        parts: indices of the parts.
-        parent: index of a part of the parent body, -1 for the base itself.
-        dofs: indices of the degrees of freedom between parent and body.
-    """
+    """Parts that no joint separates, a part of the parent body (-1: the base), and the joints between them."""
 
     parts: tuple[int, ...]
     parent: int
@@ -27,12 +21,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Limb:
-    """A chain of bodies without branches, as a finger or an arm.
-
-    Args:
-        bodies: from the one nearest to the base outwards.
-        level: number of limbs between this one and the base.
-    """
+    """A chain of bodies without branches, from the base outwards; ``level`` limbs lie between it and the base."""
 
     bodies: tuple[Body, ...]
     level: int
@@ -49,15 +38,7 @@ class Limb:
 
 
 def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
-    """Return the limbs of a shape, parents before children, and the parts of its trunk, moved by the base alone.
-
-    A degree of freedom that moves several limbs, as of a gripper, belongs to the first of them.
-
-    Args:
-        shape: the articulated shape.
-
-    Cost: nothing after the first time for a shape.
-    """
+    """Return the limbs, parents before children, and the parts of the trunk; a shared joint is the first limb's."""
     if shape not in _FOUND:
         _FOUND[shape] = _find_limbs(shape)
     limbs, trunk = _FOUND[shape]

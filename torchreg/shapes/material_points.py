@@ -51,12 +51,9 @@ class MaterialPoints(nn.Module):
     """Points that move by a weighted mean of the motions of parts, with weights of a file or of eq. 3.
 
     Args:
-        points: (N, 3) in the reference pose, metres.
-        to_parts: (P, 4, 4) ``T_part_world`` there.
+        to_parts: (P, 4, 4) ``T_part_world`` in the reference pose.
         weights: (N, P), rows sum to one; under eq. 3 one for the dominating part.
         partners: (N, P) for the strongest neighbor of that part; None for the weights of a file.
-
-    References: Dewaele et al. 2006, eq. 3.
     """
 
     points: Tensor
@@ -75,18 +72,7 @@ class MaterialPoints(nn.Module):
         return len(self.points)
 
     def forward(self, transforms: Tensor, growth: Tensor, shares: Tensor | None = None) -> Tensor:
-        """Return the points of parts that moved and grew.
-
-        Args:
-            transforms: (..., P, 4, 4) ``T_world_part``.
-            growth: (P, 4, 4) affine, how each part has grown in its own coordinates.
-            shares: (N,) of the partners in the motions of the points; none by default.
-
-        Returns:
-            (..., N, 3), metres.
-
-        Differentiable: in all.
-        """
+        """Return the points (..., N, 3) for part transforms (..., P, 4, 4) and the growth (P, 4, 4) of the parts."""
         weights = self.weights
         if shares is not None and self.partners is not None:
             weights = weights + shares.unsqueeze(-1) * (self.partners - weights)
@@ -96,12 +82,7 @@ class MaterialPoints(nn.Module):
 
 
 def mesh_points(surface: RigSurface, to_parts: Tensor) -> MaterialPoints:
-    """Return the vertices of a file's mesh in their order, or samples of it where links of a robot have few or many.
-
-    Args:
-        surface: in the pose of all zeros.
-        to_parts: (P, 4, 4) there.
-    """
+    """Return the vertices of a file's mesh in their order, or samples of it where links of a robot have few or many."""
     if not surface.is_rigid:
         return MaterialPoints(surface.vertices.to(to_parts), to_parts, surface.weights.to(to_parts))
     mesh = TriangleMesh(surface.vertices.to(to_parts), surface.faces)
@@ -115,15 +96,7 @@ def mesh_points(surface: RigSurface, to_parts: Tensor) -> MaterialPoints:
 def fused_points(
     solids: PrimitiveSet, frames: Tensor, neighbors: Tensor, nu: float, to_parts: Tensor
 ) -> MaterialPoints:
-    """Return points that cover the fused surface of solids evenly, under the bending skin.
-
-    Args:
-        solids: of the parts.
-        frames: (P, 4, 4) of the solids in the reference pose.
-        neighbors: (P, P) booleans, which solids fuse; True on the diagonal.
-        nu: fusion length, metres.
-        to_parts: (P, 4, 4) in the reference pose.
-    """
+    """Return points that cover the fused surface of solids with frames (P, 4, 4) at reference evenly."""
     sizes = list(solids.sizes)
     # As many candidates for each solid as its size asks for.
     across, _, along = solids.half_extents(sizes).unbind(-1)
@@ -156,25 +129,7 @@ def onto_fused(
     fuses: Tensor,
     nu: float | Tensor,
 ) -> Tensor:
-    """Return points after one Newton step onto the fused surface of their own solids, ``x - d grad d / |grad d|^2``.
-
-    Each point keeps the solids that it is fused from: a finger that touches another leaves its points alone.
-
-    Args:
-        solids: of the parts.
-        sizes: from `PrimitiveSet.scaled_sizes`.
-        frames: (..., P, 3, 4) ``[R | t]`` of the solids.
-        points: (..., N, 3), metres.
-        fuses: (N, P) booleans, the solids of each point.
-        nu: fusion length, metres.
-
-    Returns:
-        (..., N, 3), metres.
-
-    Differentiable: in ``sizes``, ``frames``, ``points`` and ``nu``.
-
-    References: Dewaele et al. 2006, eqs. 1 and 2.
-    """
+    """Return points (..., N, 3) after one Newton step onto their fused surface, ``x - d grad d / |grad d|^2``."""
     inverse = frames[..., :3].mT
     local = (inverse.flatten(-3, -2) @ points.mT).unflatten(-2, (-1, 3)) - inverse @ frames[..., 3:]
     x, y, z = local.unbind(-2)

@@ -17,33 +17,13 @@ BASE_DOFS = len(BASE_DOF_NAMES)
 
 
 def retract(pose: Tensor, step: Tensor) -> Tensor:
-    """Return the pose moved by a step; the base rotation is updated by composition, ``exp(step) exp(w)``.
-
-    Args:
-        pose: (..., num_dofs).
-        step: (..., num_dofs), metres and radians.
-
-    Returns:
-        (..., num_dofs).
-
-    Differentiable: in both.
-    """
+    """Return poses (..., D) moved by steps (..., D); the base's rotations are composed, ``exp(step) exp(w)``."""
     rotated = compose_rotation_vectors(step[..., 3:6], pose[..., 3:6])
     return torch.cat([pose[..., :3] + step[..., :3], rotated, pose[..., 6:] + step[..., 6:]], dim=-1)
 
 
 def difference(start: Tensor, end: Tensor) -> Tensor:
-    """Return the step that `retract` takes from one pose to another.
-
-    Args:
-        start: (..., num_dofs).
-        end: (..., num_dofs), with batch dimensions that broadcast with the start's.
-
-    Returns:
-        (..., num_dofs); the base's rotation by an angle of at most pi.
-
-    Differentiable: in both, where that angle is below pi.
-    """
+    """Return the steps (..., D) that `retract` takes from one pose to another; the base turns by at most pi."""
     rotated = compose_rotation_vectors(end[..., 3:6], -start[..., 3:6])
     return torch.cat([end[..., :3] - start[..., :3], rotated, end[..., 6:] - start[..., 6:]], dim=-1)
 

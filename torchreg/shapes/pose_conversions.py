@@ -100,21 +100,7 @@ class ManoPose:
 
 
 def reorder_keypoints(keypoints: Tensor, source: str, target: str) -> Tensor:
-    """Return 21 keypoints in the order of another convention, see `KEYPOINT_ORDERS`.
-
-    Args:
-        keypoints: (..., 21, C) coordinates, in the order of ``source``.
-        source: a key of `KEYPOINT_ORDERS`.
-        target: a key of `KEYPOINT_ORDERS`.
-
-    Returns:
-        (..., 21, C).
-
-    Raises:
-        InputError: if a convention is unknown or the keypoints are not 21.
-
-    Differentiable: in ``keypoints``.
-    """
+    """Return 21 keypoints (..., 21, C) in the order of another convention; both are keys of `KEYPOINT_ORDERS`."""
     check_choice(source, "source", tuple(KEYPOINT_ORDERS))
     check_choice(target, "target", tuple(KEYPOINT_ORDERS))
     check_shape(keypoints, "keypoints", (21, "C"), batch=True)
@@ -122,19 +108,10 @@ def reorder_keypoints(keypoints: Tensor, source: str, target: str) -> Tensor:
 
 
 def keypoints_from_xr(joints: Tensor, api: str = "webxr") -> Tensor:
-    """Return the 21 keypoints among the joints of WebXR or OpenXR, which have the metacarpals' bases too.
+    """Return the 21 keypoints (..., 21, C), from wrist to little finger, base to tip, of "webxr" or "openxr" joints.
 
-    Args:
-        joints: (..., 25, C) in the order of `WEBXR_JOINTS`, or (..., 26, C) in that of `OPENXR_JOINTS`.
-        api: "webxr" or "openxr".
-
-    Returns:
-        (..., 21, C), wrist, then thumb to little finger, base to tip.
-
-    Raises:
-        InputError: if ``api`` is unknown or the joints are not as many.
-
-    Differentiable: in ``joints``.
+    The joints (..., 25 or 26, C) come in the order of `WEBXR_JOINTS` or `OPENXR_JOINTS`; the metacarpals' bases are
+    left out.
     """
     check_choice(api, "api", tuple(_XR_SIZES))
     check_shape(joints, "joints", (_XR_SIZES[api], "C"), batch=True)
@@ -142,22 +119,11 @@ def keypoints_from_xr(joints: Tensor, api: str = "webxr") -> Tensor:
 
 
 def to_mano_pose(hand: Hand, pose: Tensor, *, flat_pose: Tensor | None = None) -> ManoPose:
-    """Return MANO's joint rotations of a hand's pose; no MANO file is needed.
+    """Return MANO's joint rotations of a hand's pose (..., 27); no MANO file is needed.
 
     MANO's joint frames are parallel in its rest pose: palm down, fingers along -x (right) or +x (left), thumb on +z. A
-    part's rotation from there is ``M = G(pose) G(flat)^-1``, and MANO's joint turns by ``M_parent^-1 M``.
-
-    Args:
-        hand: the hand.
-        pose: (..., 27).
-        flat_pose: (27,) the pose in which the hand's bones point as MANO's do at rest; all zeros by default.
-
-    Raises:
-        InputError: if a pose has the wrong size.
-
-    Differentiable: in ``pose``, at joint angles other than zero and half turns too.
-
-    References: Romero, Tzionas, Black 2017, Embodied Hands.
+    part's rotation from there is ``M = G(pose) G(flat)^-1``, and MANO's joint turns by ``M_parent^-1 M``. In
+    ``flat_pose`` (27,), zeros by default, the bones point as MANO's do at rest. Romero, Tzionas, Black 2017.
     """
     pose = hand.check_pose(pose)
     axes, flat = _mano_axes(hand), _flat_rotations(hand, flat_pose)
@@ -170,23 +136,11 @@ def to_mano_pose(hand: Hand, pose: Tensor, *, flat_pose: Tensor | None = None) -
 
 
 def from_mano_pose(hand: Hand, mano: ManoPose, *, flat_pose: Tensor | None = None) -> Tensor:
-    """Return the hand's pose nearest to MANO's joint rotations, see `to_mano_pose`.
+    """Return the hand's pose (..., 27) nearest to MANO's joint rotations, see `to_mano_pose`.
 
     MANO's joints are ball joints; each joint of the hand takes its rotation nearest to MANO's in the squared difference
-    of the matrices, whatever the joints before it left over. Limits are not applied: see `ArticulatedShape.clamp`.
-
-    Args:
-        hand: the hand.
-        mano: MANO's parameters, with matching leading dimensions; add MANO's mean pose first if it is in use.
-        flat_pose: (27,) the pose in which the hand's bones point as MANO's do at rest; all zeros by default.
-
-    Returns:
-        (..., 27).
-
-    Raises:
-        InputError: if a size is wrong.
-
-    Differentiable: in the parameters.
+    of the matrices, whatever the joints before it left over. Limits are not applied: see `ArticulatedShape.clamp`. Add
+    MANO's mean pose first if it is in use.
     """
     check_shape(mano.hand_pose, "hand_pose", (15, 3), batch=True)
     check_shape(mano.global_orient, "global_orient", (3,), batch=True)

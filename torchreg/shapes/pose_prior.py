@@ -267,7 +267,7 @@ class PosePrior(nn.Module):
         return linear
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the prior to ``path``, which ends in .safetensors, and a JSON file beside it; see `load`."""
+        """Write the prior to ``path``, which ends in .safetensors, and a JSON file next to it; see `load`."""
         tensors = dict(self.named_buffers())
         save_tensors(path, tensors, {"kind": _KIND, "residual": self.residual, "has_base": self.has_base})
 

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 
 class PosedTree(nn.Module):
-    """Parts on a kinematic tree with a base that moves; see `ArticulatedShape` for conventions and arguments.
-
-    Attributes:
-        is_sliding: (num_dofs,) bool, degrees of freedom in metres: the base's translation and prismatic joints.
-    """
+    """Parts on a kinematic tree with a moving base; `ArticulatedShape` explains conventions and arguments."""
 
     adjacency: Tensor
     part_index: Tensor
@@ -148,7 +144,7 @@ class PosedTree(nn.Module):
             values: numbers or tensors (...) that broadcast, metres and radians.
 
         Raises:
-            InputError: if a name is unknown; it tells the nearest one.
+            InputError: if a name is unknown; the message names the nearest one.
 
         Differentiable: in the values.
         """
@@ -196,19 +192,7 @@ class PosedTree(nn.Module):
         return difference(start, end)
 
     def frame_transforms(self, pose: Tensor) -> Tensor:
-        """Return ``T_world_frame`` of every frame of the tree.
-
-        Args:
-            pose: (..., num_dofs).
-
-        Returns:
-            (..., F, 4, 4).
-
-        Raises:
-            InputError: if the pose has the wrong size.
-
-        Differentiable: in ``pose`` and `log_length_scales`.
-        """
+        """Return ``T_world_frame`` (..., F, 4, 4) of every frame of the tree in poses (..., num_dofs)."""
         check_shape(pose, "pose", (self.num_dofs,), batch=True)
         base = rigid_matrix(so3_exp(pose[..., 3:6]), pose[..., :3])
         return base.unsqueeze(-3) @ self.kinematics(pose[..., 6:], self._offset_scales())
@@ -246,16 +230,7 @@ class PosedTree(nn.Module):
         return self.placed_keypoints(self.part_transforms(pose))
 
     def placed_keypoints(self, transforms: Tensor) -> Tensor:
-        """Return the keypoints for given part transforms.
-
-        Args:
-            transforms: (..., P, 4, 4) ``T_world_part``.
-
-        Returns:
-            (..., K, 3), metres, as `keypoints`.
-
-        Differentiable: in ``transforms`` and `log_length_scales`.
-        """
+        """Return the keypoints (..., K, 3), metres, for part transforms (..., P, 4, 4) ``T_world_part``."""
         return transforms[..., :3, 3]
 
     def part_twists(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
@@ -320,14 +295,7 @@ class PosedTree(nn.Module):
         return self._owners
 
     def length_motions(self, frames: Tensor) -> Tensor:
-        """Return how far frames move as the logarithm of each part's length grows.
-
-        Args:
-            frames: (..., F, 4, 4) of a pose, see `frame_transforms`.
-
-        Returns:
-            (..., F, 3, P), metres.
-        """
+        """Return the motions (..., F, 3, P), metres, of frames (..., F, 4, 4) as the log length of each part grows."""
         above = frames[..., [max(joint.parent, 0) for joint in self.kinematics.tree.joints], :3, :3]
         offsets = self.kinematics.lengths.unflatten(-1, (4, 4))[:, :3, 3] * self._offset_scales().unsqueeze(-1)
         offsets = above @ offsets.to(frames).unsqueeze(-1)
@@ -353,7 +321,7 @@ def named_pose(shape: PosedTree | None, pose: Tensor) -> dict[str, Any]:
 
 
 def frozen(value: Tensor) -> nn.Parameter:
-    """Return a parameter that takes no gradients until it is told to."""
+    """Return a parameter that takes no gradients until they are required."""
     return nn.Parameter(value, requires_grad=False)
 
 

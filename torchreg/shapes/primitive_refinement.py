@@ -23,7 +23,7 @@ class _RefinementSettings:
 
     # Robust scale of the residuals, in fusion lengths.
     robust_scale: float = 1.5
-    # Weight of the distance to the solid that owns a point, beside that of the fused distance.
+    # Weight of the distance to the solid that owns a point, relative to that of the fused distance.
     owner_weight: float = 0.3
     # Weight of the excess of that distance over the one to the nearest solid.
     excess_weight: float = 0.3
@@ -47,24 +47,11 @@ def refine_primitives(
     owners: Tensor,
     max_steps: int = _REFINEMENT.max_steps,
 ) -> list[Primitive]:
-    """Return solids moved, turned and resized so that their fused surface runs through surface points.
+    """Return solids moved, turned and resized so that their fused surface runs through points (N, 3) on the surface.
 
-    Damped least squares over all solids at once: the fused distance of every point, with less weight the distance to
-    the solid that owns it and its excess over that to the nearest solid, and a weak prior at the start, which holds
-    solids of which only a patch is seen. Residuals beyond the fusion length lose weight.
-
-    Args:
-        primitives: first guess, one per part, with poses in the points' coordinates.
-        neighbors: (P, P) booleans, which solids fuse; True on the diagonal.
-        nu: fusion length, metres.
-        points: (N, 3) on the surface, metres.
-        owners: (N,) part that each point belongs to.
-        max_steps: damped least-squares steps.
-
-    Returns:
-        Solids, one per part, of the same kinds.
-
-    References: Marquardt 1963.
+    Damped least squares over all solids at once (Marquardt 1963): the fused distance of every point, with less weight
+    the distance to its own solid (N,) and its excess over that to the nearest solid, and a weak prior at the start,
+    which holds solids observed in part. The solids have poses in the points' coordinates.
     """
     solids = PrimitiveSet(primitives).requires_grad_(False)
     problem = _RefinementProblem(solids, neighbors, nu, points.double(), owners)
@@ -95,10 +82,8 @@ class _Fields:
 
     Args:
         offset: (P, width) of the state from the start, centers in the solids' frames.
-        sizes: of the solids, kind by kind.
         local: (P, 3, N) points in the frames of the solids.
         shares: (N, P) of the solids in the fused distance.
-        nearest: (N,) numbers of the nearest solids.
         residuals: (N, 3) fused distance, that to the own solid, and its excess over that to the nearest one.
         squared: (N, 3) squares of the residuals, in robust scales.
     """
@@ -183,11 +168,7 @@ class _RefinementProblem:
         return 0.5 * (robust + (self._stiffness * fields.offset.square()).sum())
 
     def derivatives(self, fields: _Fields) -> tuple[Tensor, Tensor]:
-        """Return gradient (D,) and Gauss-Newton Hessian (D, D) at a state.
-
-        A point's residuals depend on its own solid and on those that share in the fused distance there, a few of many:
-        only these pairs of points and solids are differentiated, and points with the same solids are taken together.
-        """
+        """Return gradient (D,) and Gauss-Newton Hessian (D, D) at a state; points with the same solids go together."""
         gradient, hessian = (self._stiffness * fields.offset).flatten(), self._stiffness.flatten().diag()
         concerned = fields.shares > _REFINEMENT.least_share
         for always in (self.owners, fields.nearest):
@@ -204,13 +185,7 @@ class _RefinementProblem:
         return gradient, hessian
 
     def _motions(self, local: Tensor, parts: Tensor, sizes: Sequence[Tensor]) -> Tensor:
-        """Return (M, width): derivatives of distances by the motion and the logarithms of sizes of their solids.
-
-        Args:
-            local: (M, 3) points, each in the frame of its solid.
-            parts: (M,) numbers of the solids.
-            sizes: of all solids, kind by kind.
-        """
+        """Return derivatives (M, width) of distances of points (M, 3) by motion and log sizes of their solids (M,)."""
         found = torch.zeros(len(parts), self.width, dtype=torch.float64)
         for kind, size in zip(self.solids.kinds, sizes, strict=True):
             members = self.solids.get_buffer(f"members_{kind}")
@@ -246,16 +221,7 @@ def _add_sets(
     gradient: Tensor,
     hessian: Tensor,
 ) -> None:
-    """Add the terms of all points to the gradient (D,) and the Hessian (D, D).
-
-    Args:
-        jacobians: (M, width, 3) of the pairs of points and solids, point after point.
-        residuals: (N, 3) of the points.
-        parts: (M,) numbers of the pairs' solids.
-        sets: points in a row that have the same solids, and the number of these.
-        gradient: changed in place.
-        hessian: changed in place.
-    """
+    """Add the terms of all points to gradient and Hessian in place; sets are (points, solids of each) in a row."""
     width, pair, point = jacobians.shape[1], 0, 0
     entries = parts.unsqueeze(-1) * width + torch.arange(width)
     for count, solids in sets:

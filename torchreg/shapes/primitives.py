@@ -18,18 +18,18 @@ from torchreg.geometry.rigid import RIGID_TOLERANCE, rigid_matrix, rotation_erro
 
 # Radius of a ball that holds a solid, in norms of its sizes: boxes reach their corners and capsules their round ends.
 BALL_FACTOR = 1.5
-# Exponent, to base 2, of a field that is negligible beside the dominating solid's field of one, in any precision.
+# Exponent, to base 2, of a field that is negligible next to the dominating solid's field of one, in any precision.
 _MIN_EXPONENT = -120.0
 
 
 @dataclass(frozen=True)
 class Primitive:
-    """One solid of a part.
+    """One solid of a part, with its long axis along z.
 
     Args:
         kind: "ellipsoid", "capsule", "cone" or "superquadric".
         sizes: the kind's sizes, metres; see `torchreg.geometry.primitives`.
-        pose: (4, 4) ``T_part_primitive``; the solid's long axis is its z axis.
+        pose: (4, 4) ``T_part_primitive``.
     """
 
     kind: str
@@ -38,12 +38,7 @@ class Primitive:
 
 
 class DeferredSolids:
-    """Solids that are made when they are first asked for, once for all copies.
-
-    Args:
-        guess: of every part, of the same kinds.
-        make: returns the solids, one per part.
-    """
+    """Solids that are made when they are first needed, once for all copies; the guess is of the same kinds."""
 
     def __init__(self, guess: Sequence[Primitive], make: Callable[[], Sequence[Primitive]]) -> None:
         self.guess, self._make = tuple(guess), make
@@ -89,14 +84,7 @@ class _SizeTables(nn.Module):
 
 
 class PrimitiveSet(nn.Module):
-    """The solids of all parts: signed distances and their gradients, evaluated kind by kind.
-
-    Args:
-        primitives: one `Primitive` per part.
-
-    Raises:
-        ModelError: if a kind is unknown, a size is missing, not positive or not finite, or a pose is not rigid.
-    """
+    """The solids of all parts: signed distances and their gradients, evaluated kind by kind."""
 
     rotations: Tensor
     centers: Tensor
@@ -135,14 +123,7 @@ class PrimitiveSet(nn.Module):
         return [Primitive(kind, sizes[part], poses[part]) for part, kind in enumerate(self.part_kinds)]
 
     def scaled_sizes(self, length_scales: Tensor, radius_scales: Tensor) -> list[Tensor]:
-        """Return the sizes (P_kind, S_kind) of each kind's solids with lengths along z and radii across it scaled.
-
-        Args:
-            length_scales: (P,).
-            radius_scales: (P,).
-
-        Differentiable: in both, and in the sizes.
-        """
+        """Return the sizes (P_kind, S_kind) of each kind, lengths along z and radii across it scaled by (P,)."""
         scaled = []
         for name, sizes in zip(self.kinds, self.sizes, strict=True):
             along, across = length_scales, radius_scales
@@ -173,32 +154,11 @@ class PrimitiveSet(nn.Module):
         return torch.cat(balls)[self.kind_order] * BALL_FACTOR
 
     def forward(self, local_points: Tensor, sizes: Sequence[Tensor]) -> Tensor:
-        """Return the distance of points to every part's solid.
-
-        Args:
-            local_points: (..., P, 3), each part's column in that solid's frame, metres.
-            sizes: from `scaled_sizes`.
-
-        Returns:
-            (..., P), metres, negative inside.
-
-        Differentiable: in both.
-        """
+        """Return the distances (..., P), metres, of points (..., P, 3), each in the frame of its solid."""
         return self.plane_distance(_single_column(local_points), sizes).squeeze(-1)
 
-    def distance_and_gradient(self, local_points: Tensor, sizes: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the distances (..., P) and their analytic gradients (..., P, 3) in the solids' frames."""
-        distance, planes = self.plane_gradient(_single_column(local_points), sizes)
-        return distance.squeeze(-1), torch.cat(planes, dim=-1)
-
     def plane_distance(self, planes: Planes, sizes: Sequence[Tensor], parts: Sequence[int] | None = None) -> Tensor:
-        """Return the distances (..., P, N) of points given as planes x, y and z (..., P, N), see `forward`.
-
-        Args:
-            planes: one row per part, or per member of ``parts``.
-            sizes: from `scaled_sizes`.
-            parts: the parts whose solids the rows belong to; all by default.
-        """
+        """Return the distances (..., P, N) of points as planes x, y, z (..., P, N), one row per part of ``parts``."""
         groups = self._by_kind(sizes, parts)
         columns = [
             PRIMITIVE_KINDS[group.kind].plane_distance(group.pick(planes), group.sizes.unsqueeze(-2))
@@ -262,22 +222,7 @@ def _in_order(groups: Sequence[_KindRows], planes: Sequence[Tensor]) -> Tensor:
 
 
 def fuse(distances: Tensor, neighbors: Tensor, nu: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distance to the fused surface, ``-nu log phi``, and the weights of the solids in its gradient.
-
-    phi sums the fields ``exp(-d_q / nu)`` of the dominating solid and its neighbors only, in the log domain.
-
-    Args:
-        distances: (..., P) to every solid, metres.
-        neighbors: (P, P) booleans, True on the diagonal.
-        nu: fusion length, metres.
-
-    Returns:
-        Distances (...), metres, and weights (..., P), which sum to one.
-
-    Differentiable: in ``distances`` and ``nu``, where the dominating solid is unique.
-
-    References: Dewaele et al. 2006, eqs. 1 and 2.
-    """
+    """Return the distance (...) to the fused surface, ``-nu log phi``, and its weights (..., P); eqs. 1 and 2."""
     nearest, dominating = distances.min(dim=-1, keepdim=True)
     # Zero or one per point and solid; in the memory order of distances of planes.
     fuses = neighbors.to(distances.dtype).index_select(-1, dominating.flatten())
@@ -286,10 +231,7 @@ def fuse(distances: Tensor, neighbors: Tensor, nu: float | Tensor) -> tuple[Tens
 
 
 def fuse_given(distances: Tensor, fuses: Tensor, nu: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Return what `fuse` does, of solids (N, P) that are given for each point whichever dominates.
-
-    Differentiable: in ``distances`` and ``nu``.
-    """
+    """Return the output of `fuse` for solids (N, P) that are given for each point, whichever dominates."""
     nearest = distances.masked_fill(~fuses, torch.inf).amin(-1, keepdim=True)
     return _summed(torch.where(fuses, distances, nearest), nearest, fuses.to(distances.dtype), nu)
 

@@ -20,14 +20,7 @@ _NUM_NEW = 2
 
 @dataclass(frozen=True)
 class HandSpec:
-    """The arguments of a `Hand`.
-
-    Args:
-        side: "right" or "left".
-        scale: overall size, 1 for an adult.
-        nu: fusion length, metres.
-        sharpness: of the bending skin.
-    """
+    """The arguments of a `Hand`."""
 
     side: str
     scale: float
@@ -40,9 +33,7 @@ class ShapeRecord:
     """A shape as plain data.
 
     Args:
-        spec: the tree, parts and solids that it is built from.
-        free_base: whether its base moves.
-        parameters: what is learnt and what it multiplies: logarithms of lengths and radii, centers and sizes of the
+        parameters: what is learned and what it multiplies: logarithms of lengths and radii, centers and sizes of the
             solids, logarithms of nu and of the sharpness. Earlier releases left the last two out.
         learnable: which of them require gradients.
     """
@@ -54,11 +45,7 @@ class ShapeRecord:
 
 
 def record_shape(shape: ArticulatedShape) -> ShapeRecord:
-    """Return a shape as plain data; its tensors are detached, on the CPU and not shared with it.
-
-    Raises:
-        InputTypeError: if the shape is of a class that this release does not know how to build.
-    """
+    """Return a shape as plain data; its tensors are detached, on the CPU and not shared with it."""
     spec: ShapeSpec | HandSpec
     if type(shape) is Hand:
         spec = HandSpec(shape.side, shape.scale, shape.start_nu, shape.start_sharpness)
@@ -87,12 +74,7 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
 
 
 def build_shape(record: ShapeRecord) -> ArticulatedShape:
-    """Return the shape that a record describes, a new module on the CPU.
-
-    Raises:
-        ModelError: if the parameters do not fit the spec, or no shape can be built from it.
-        InputError: if a hand has an unknown side, or a scale or fusion length that is not positive.
-    """
+    """Return the shape that a record describes, a new module on the CPU."""
     dtypes = {value.dtype for value in record.parameters}
     if len(dtypes) != 1 or not (dtype := dtypes.pop()).is_floating_point:
         raise ModelError("a shape needs parameters of one floating-point dtype")
@@ -115,17 +97,14 @@ def build_shape(record: ShapeRecord) -> ArticulatedShape:
     with torch.no_grad():
         for tensor, value, learnable in zip(tensors, record.parameters, record.learnable, strict=True):
             tensor.copy_(value)
-            # In earlier releases everything required gradients unless it was told not to.
+            # In earlier releases everything required gradients by default.
             if isinstance(tensor, nn.Parameter) and not is_early:
                 tensor.requires_grad_(learnable)
     return shape
 
 
 def record_kept_shape(shape: ArticulatedShape | None) -> ShapeRecord | None:
-    """Return a shape as the file of a result keeps it: without its mesh where that takes more than 4 MB.
-
-    None for None, and for a shape of a class that this release does not know how to build.
-    """
+    """Return the record of a shape for the file of a result, without a mesh above 4 MB; None for unknown classes."""
     if shape is None or type(shape) not in (Hand, ArticulatedShape):
         return None
     record = record_shape(shape)

@@ -72,11 +72,7 @@ def spec_from_gltf(
 
 
 def _one_tree(parents: Sequence[int], names: Sequence[str]) -> list[int]:
-    """Return parents in which every tree of joints hangs on the root of the largest.
-
-    A hierarchy that is flat, all joints side by side, stays as it is: its joints do have parents, but the file does not
-    tell them.
-    """
+    """Return parents in which every tree of joints hangs on the root of the largest; a flat hierarchy stays flat."""
     joined, roots = list(parents), [index for index, parent in enumerate(parents) if parent == -1]
     if len(roots) < 2 or len(roots) > max(_FIT.most_roots, len(parents) // 2):
         return joined
@@ -111,11 +107,7 @@ def spec_from_arrays(
     slides: Sequence[str] = (),
     up: Direction = Y_UP,
 ) -> ShapeSpec:
-    """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`.
-
-    Solids of the parts, in their joints' frames, are fitted unless they are given. Joints in ``slides`` slide, too,
-    along the axes of their frames.
-    """
+    """Return the `ShapeSpec` of a skinned mesh, as `from_skinned_mesh`; joints in ``slides`` slide as well."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
     vertices = as_float_tensor(vertices, "vertices").double()
     frames = _joint_frames(as_float_tensor(joints, "joints").double())
@@ -195,11 +187,7 @@ def _skin_weights(weights: Tensor, shape: tuple[int, int]) -> Tensor:
 
 
 def topological_order(parents: Sequence[int], names: Sequence[str]) -> list[int]:
-    """Return joint indices with every parent before its children.
-
-    Raises:
-        ModelError: if the hierarchy is cyclic, has several roots, or names a joint that is not there.
-    """
+    """Return joint indices with every parent before its children; ModelError where there is no such order."""
     for name, parent in zip(names, parents, strict=True):
         if not -1 <= parent < len(parents):
             raise ModelError(f"joint {name!r} has parent index {parent}, but there are {len(parents)} joints")
@@ -253,14 +241,7 @@ def _carries_skin(parents: Sequence[int], order: Sequence[int], weights: Tensor)
 
 @dataclass(frozen=True)
 class _Move:
-    """A degree of freedom of a rig's joint.
-
-    Args:
-        suffix: of its name.
-        axis: in the joint's frame.
-        kind: of `Joint`.
-        limits: smallest and largest value, radians or metres.
-    """
+    """A degree of freedom of a rig's joint: the suffix of its name, its axis in the joint's frame, kind and limits."""
 
     suffix: str
     axis: str | Sequence[float]

@@ -42,7 +42,7 @@ class _RobotFit:
     segments: int = 24
     # Radius of the capsules that stand for links without geometry, in median distances between frames: a finger's.
     radius_per_bone: float = 0.1
-    # Of links whose color the file does not tell: bare metal.
+    # Of links without a color in the file: bare metal.
     color: tuple[float, float, float] = (0.7, 0.7, 0.72)
 
 
@@ -198,7 +198,7 @@ def _sphere(size: Sequence[float]) -> _LinkSolid:
     return _LinkSolid(("ellipsoid", (*size, *size, *size)), _revolved(_round_outline(size[0], 0.0)))
 
 
-# Kinds of geometry that a robot description may hold beside meshes; cylinders and capsules lie along z, centered.
+# Kinds of geometry that a robot description may hold besides meshes; cylinders and capsules lie along z, centered.
 _GEOMETRY: dict[str, Callable[[Sequence[float]], _LinkSolid]] = {
     "box": _box,
     "cylinder": _cylinder,
@@ -230,10 +230,7 @@ def _revolved(outline: Tensor) -> TriangleMesh:
 
 
 def solid_mesh(solid: UrdfPrimitive) -> TriangleMesh:
-    """Return a closed mesh of a solid of a robot description, in the coordinates of its link.
-
-    Round solids get 24 facets around their axis, with vertices on the surface.
-    """
+    """Return a closed mesh of a solid in the coordinates of its link; round ones get 24 facets around their axis."""
     mesh = _GEOMETRY[solid.kind](solid.size).mesh
     return TriangleMesh(transform_points(solid.origin, mesh.vertices), mesh.faces)
 

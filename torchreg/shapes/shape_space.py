@@ -13,16 +13,9 @@ RestFunction = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True, eq=False)
 class CoefficientPrior:
-    """What is known of shape coefficients before any data.
+    """A prior on K shape coefficients: mean, standard deviations and limits.
 
-    Args:
-        names: K names.
-        mean: (K,).
-        std: (K,) standard deviations.
-        lower: (K,) limits.
-        upper: (K,) limits.
-        alike: (K,) numbers of groups of coefficients whose common deviation is not known, of which ``std`` is a guess;
-            -1 for others. None where there are no such groups.
+    Coefficients of one number in ``alike`` (K,) share an unknown deviation, of which ``std`` is a guess; -1: others.
     """
 
     names: tuple[str, ...]
@@ -43,11 +36,7 @@ class CoefficientPrior:
 
 
 class ShapeSpace(nn.Module):
-    """Rest vertices and rest frames of a rig that depend on K coefficients.
-
-    Args:
-        prior: on the coefficients.
-    """
+    """Rest vertices and rest frames of a rig that depend on K coefficients."""
 
     mean: Tensor
     std: Tensor
@@ -73,16 +62,7 @@ class ShapeSpace(nn.Module):
         )  # fmt: skip
 
     def rest(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rest state for coefficients.
-
-        Args:
-            coefficients: (..., K).
-
-        Returns:
-            Vertices (..., V, 3) and positions of the frames of the tree (..., F, 3), metres.
-
-        Differentiable: in the coefficients.
-        """
+        """Return rest vertices (..., V, 3) and positions of the tree's frames (..., F, 3) for coefficients (..., K)."""
         raise NotImplementedError
 
     def rest_jacobian(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,11 +87,7 @@ class LinearSpace(ShapeSpace):
     """Rest states that are linear in features of the coefficients, ``vertices + vertex_dirs @ features(c)``.
 
     Args:
-        vertices: (V, 3) where the features are zero, metres.
         vertex_dirs: (V, 3, L).
-        frames: (F, 3) where the features are zero, metres.
-        frame_dirs: (F, 3, L).
-        prior: on the coefficients.
         features: takes coefficients (..., K) to features (..., L); None where they are the coefficients.
     """
 
@@ -168,7 +144,6 @@ class FunctionSpace(ShapeSpace):
         function: takes coefficients (..., K) to vertices (..., V, 3) and positions of the joints (..., J, 3), metres;
             differentiable twice, and of each row of coefficients by itself.
         owners: (F,) the joint at which each frame of the tree lies.
-        prior: on the coefficients.
         index: (U,) vertices that count; all if None.
     """
 
@@ -199,10 +174,7 @@ def _along(directions: Tensor, values: Tensor) -> Tensor:
 
 
 def _row_jacobians(function: Callable[[Tensor], tuple[Tensor, ...]], inputs: Tensor) -> list[Tensor]:
-    """Return the derivatives (B, ..., K) of each value (B, ...) of a function of rows (B, K), each by its own row.
-
-    The product ``J^T u`` is linear in u; its derivative by u is J, in K backward passes.
-    """
+    """Return the derivatives (B, ..., K) of each value (B, ...) of a function of rows (B, K), each by its own row."""
     with torch.inference_mode(False), torch.enable_grad():
         rows = inputs.detach().clone().requires_grad_()
         values = function(rows)

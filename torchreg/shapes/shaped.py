@@ -22,10 +22,6 @@ class _Posed(NamedTuple):
     """A rig in states: the quantities that points and their derivatives share.
 
     Args:
-        pose: (..., num_dofs of the rig).
-        coefficients: (..., K).
-        vertices: (..., U, 3) at rest.
-        frames: (..., F, 4, 4) ``T_world_frame``.
         above: (..., F, 3, 3) turn from rest of what carries each frame.
         turns: (..., P, 3, 3) S_p.
         offsets: (..., P, 3) ``t_p - S_p j_p``.
@@ -41,12 +37,7 @@ class _Posed(NamedTuple):
 
 
 class ShapedTree(nn.Module):
-    """The degrees of freedom of a rig, followed by its coefficients.
-
-    Args:
-        rig: the rig at the coefficients' mean, or any other.
-        space: of its rest states.
-    """
+    """The degrees of freedom of a rig, followed by its coefficients."""
 
     parents: Tensor
     ancestors: Tensor
@@ -134,7 +125,6 @@ class ShapedSkin(nn.Module):
     Like a `LinearBlendSkin` it is linear in rows; these are the points themselves, followed by their normals.
 
     Args:
-        tree: of the rig.
         corners: (N, C) vertices between which each point lies: one, or the three of a face.
         shares: (N, C) barycentric weights.
         weights: (N, P) of skinning, rows sum to one.
@@ -176,10 +166,7 @@ class ShapedSkin(nn.Module):
         return ShapedSkin(self.shape, self.vertex_index(index), self.shares[index], self.weights[index])
 
     def forward(self, state: Tensor) -> Tensor:
-        """Return the points (..., N, 3) in states (..., D + K), metres.
-
-        Differentiable: in the state.
-        """
+        """Return the points (..., N, 3) in states (..., D + K), metres."""
         return self._placed(self.shape.posed(state, self.space))[0]
 
     def place(self, rows: Tensor) -> Tensor:

@@ -35,15 +35,7 @@ _TOLERANCES = _Tolerances()
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The arguments by which `ArticulatedShape.from_skinned_mesh` gets coefficients, see there.
-
-    Args:
-        shape_dirs: (V, 3, K), or a function of coefficients.
-        joint_dirs: (J, 3, K).
-        joint_regressor: (J, V).
-        names: K names.
-        std: of the prior.
-    """
+    """The arguments from which `ArticulatedShape.from_skinned_mesh` makes coefficients."""
 
     shape_dirs: ShapeDirs | None = None
     joint_dirs: Tensor | None = None
@@ -54,17 +46,7 @@ class Coefficients:
     def space(
         self, tree: KinematicTree, vertices: Tensor, joints: Tensor, joint_names: Sequence[str]
     ) -> ShapeSpace | None:
-        """Return the space of rest states of a rig, or None where there are no coefficients.
-
-        Args:
-            tree: of the rig.
-            vertices: (V, 3) at rest, float64, metres.
-            joints: (J, 3) at rest, float64, metres.
-            joint_names: J names.
-
-        Raises:
-            InputError: if the arrays do not fit the rig or each other.
-        """
+        """Return the space of rest states of a rig, or None where there are no coefficients."""
         if self.shape_dirs is None:
             given = [name for name in ("joint_dirs", "joint_regressor", "names") if getattr(self, name) is not None]
             if given:
@@ -133,14 +115,7 @@ def frame_joints(tree: KinematicTree, joint_names: Sequence[str]) -> Tensor:
 
 
 def person_spec(shape: Articulation, surface: RigSurface, vertices: Tensor, positions: Tensor) -> ShapeSpec:
-    """Return the specification of a rig with other rest vertices and frames, its solids grown along.
-
-    Args:
-        shape: the rig.
-        surface: of the rig.
-        vertices: (V, 3), metres.
-        positions: (F, 3) of the frames at rest, metres.
-    """
+    """Return the specification of a rig with other rest vertices and frames, its solids scaled with them."""
     tree = shape.kinematics.tree
     rest = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
     moved = rest.clone()

@@ -12,10 +12,7 @@ from torchreg.shapes.surface import SkinSurface
 class ShapedSurface(SkinSurface):
     """Distances of data to the tangent planes of a `ShapedSkin`, whose normals must be on the side of the data's.
 
-    Args:
-        skin: samples of the surface, with three corners each.
-        normals: (B, M, 3) of the data; zero where they are not known.
-        reach: two spacings of the samples or so, metres, off the rim of which planes mean little.
+    Normals (B, M, 3) of data are zero where unknown; planes mean little off a rim by more than ``reach``, metres.
     """
 
     # A datum whose normal opposes that of the surface at this cosine or below lies on another part of it.

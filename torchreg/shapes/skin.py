@@ -97,16 +97,7 @@ class LinearBlendSkin(nn.Module):
         return self.place(stacked_rows(self.shape.part_transforms(pose)))
 
     def place(self, rows: Tensor) -> Tensor:
-        """Return the points for given part transforms.
-
-        Args:
-            rows: (..., 4 P, 3) transforms as `stacked_rows` and `Articulation.transform_jacobian` stack them.
-
-        Returns:
-            (..., N, 3), metres; in memory all x come first, then all y, then all z.
-
-        Differentiable: in ``rows``.
-        """
+        """Return the points (..., N, 3) for part transforms (..., 4 P, 3) as `stacked_rows` stacks them."""
         # The product with the three coordinates as the short left side takes a fifth of the time or less.
         return nn.functional.linear(rows.mT, self.bases()[0]).mT
 
@@ -153,11 +144,7 @@ class LinearBlendSkin(nn.Module):
         return self.turn_normals(stacked_rows(self.shape.part_transforms(pose)))
 
     def turn_normals(self, rows: Tensor) -> Tensor:
-        """Return the unit normals (..., N, 3) for given part transforms, see `place`.
-
-        Raises:
-            InputError: if the skin has no normals.
-        """
+        """Return the unit normals (..., N, 3) for given part transforms, see `place`."""
         normal_basis = self.bases()[1]
         if normal_basis is None:
             raise InputError("this skin has no normals; pass normals= when building it")
@@ -254,21 +241,7 @@ class BendingSkin(LinearBlendSkin):
 
 
 def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness: float | None = None) -> Tensor:
-    """Return the weights (N, P) of eq. 3, shared by the dominating part and its strongest neighbor.
-
-    Args:
-        shape: the articulated shape.
-        points: (N, 3), metres.
-        pose: (num_dofs,) the pose in which the fields are evaluated.
-        sharpness: a; the shape's own by default.
-
-    Returns:
-        Weights (N, P), rows sum to one, at most two entries per row.
-
-    Differentiable: in ``points``, ``pose`` and all parameters of the shape.
-
-    References: Dewaele et al. 2006, eq. 3.
-    """
+    """Return the weights (N, P) of eq. 3 for points (N, 3) in a pose, at most two per row, which sum to one."""
     distances = shape.part_distances(points, pose)
     nearest, dominating = distances.min(-1)
     neighbors = shape.adjacency[dominating].scatter(-1, dominating.unsqueeze(-1), False)

@@ -23,11 +23,9 @@ class RigSurface:
     """The surface mesh of a file, in the pose of all zeros.
 
     Args:
-        vertices: (V, 3), metres.
-        faces: (F, 3) int64.
         weights: (V, P) over the parts, rows sum to one.
         is_rigid: whether it is made of rigid links, whose vertices are few or many wherever their makers liked.
-        colors: (P, 3) of the parts, red, green, blue from 0 to 1, where the file tells any.
+        colors: (P, 3) of the parts, red, green, blue from 0 to 1, where the file has any.
     """
 
     vertices: Tensor
@@ -39,18 +37,7 @@ class RigSurface:
 
 @dataclass(frozen=True)
 class ShapeSpec:
-    """The specification of an articulated shape.
-
-    Args:
-        tree: the kinematic tree.
-        part_frames: names of the frames that carry a solid.
-        primitives: one solid per part.
-        nu: fusion length, metres.
-        part_names: names of the parts.
-        surface: mesh and weights of the file, in the pose of all zeros.
-        sharpness: of the bending skin.
-        up: (3,) what is upright in the shape's own coordinates.
-    """
+    """The specification of an articulated shape; its surface is in the pose of all zeros."""
 
     tree: KinematicTree
     part_frames: tuple[str, ...]

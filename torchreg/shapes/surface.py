@@ -21,7 +21,7 @@ class _DenseSkin:
 
     # Of a file's mesh, evenly: vertices lie where the mesh bends, and far apart on its large faces.
     num_samples: int = 4000
-    # Points that tell the spacing of a skin.
+    # Points from which the spacing of a skin is estimated.
     num_spacings: int = 500
     # A datum is off the rim of a skin if its offset is this oblique (distance to the plane over distance to the point)
     # and longer than this many spacings.
@@ -43,11 +43,7 @@ class ShapeSurface(Protocol):
 
 
 class FusedSurface:
-    """The fused surface of a shape's solids, eq. 2.
-
-    Args:
-        shape: the articulated shape.
-    """
+    """The fused surface of a shape's solids, eq. 2."""
 
     def __init__(self, shape: Articulation) -> None:
         self.shape = shape
@@ -62,13 +58,7 @@ class FusedSurface:
 
 
 class SkinSurface:
-    """A dense skin with normals: distances to the tangent plane of the nearest skin point.
-
-    For shapes from files with a mesh it is closer to the true surface than the fused solids.
-
-    Args:
-        skin: a skin with normals, dense enough that its points' tangent planes follow the surface.
-    """
+    """A dense skin with normals: distances to the tangent plane of the nearest skin point."""
 
     def __init__(self, skin: LinearBlendSkin) -> None:
         self.skin = skin
@@ -109,10 +99,7 @@ def _spacing(points: Tensor, first: Tensor) -> float:
 
 
 def _first_copies(skin: LinearBlendSkin) -> Tensor:
-    """Return the first point that coincides with each skin point in every pose: files split vertices along seams.
-
-    Copies may differ in their normals, and the choice between them must not depend on the search for neighbors.
-    """
+    """Return the first point that coincides with each skin point in every pose: files split vertices along seams."""
     group = torch.unique(skin.points, dim=0, return_inverse=True)[1]
     index = torch.arange(len(skin), device=group.device)
     first = torch.full_like(index, len(skin)).scatter_reduce(0, group, index, "amin")[group]
@@ -120,11 +107,7 @@ def _first_copies(skin: LinearBlendSkin) -> Tensor:
 
 
 def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
-    """Return a dense skin of samples, with normals, of the file's mesh.
-
-    Raises:
-        InputError: if the shape was not read from a file with a mesh.
-    """
+    """Return a dense skin of samples, with normals, of the file's mesh."""
     surface = shape.surface
     if surface is None:
         raise InputError("this shape has no file surface: it was not read from a file with a mesh")
