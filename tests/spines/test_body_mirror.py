@@ -5,10 +5,10 @@ import torch
 
 from experiments.made_up.bodies import person
 from experiments.made_up.gaits import person_tucks
-from torchreg.spines.body_mirror import _exchanges, _images, find_mirror
-from torchreg.spines.name_chain import name_over_time
-from torchreg.spines.name_model import _background
-from torchreg.spines.tip_features import TipFeatures, TipObservations
+from torchreg.spines.names.body_mirror import _exchanges, _images, find_mirror
+from torchreg.spines.names.name_chain import name_over_time
+from torchreg.spines.names.name_model import _background
+from torchreg.spines.names.tip_features import TipFeatures, TipObservations
 
 
 def random(*size, seed=0):

@@ -8,10 +8,10 @@ from torchreg.errors import InputError
 from torchreg.geometry.cloud_surface import cloud_surface
 from torchreg.geometry.mesh import sample_surface, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.spines import surfaces
 from torchreg.spines.extract_spine import extract_spine
+from torchreg.spines.frames import frame_surfaces
+from torchreg.spines.frames.frame_surfaces import FrameSurfaces
 from torchreg.spines.skeletonize import skeletonize
-from torchreg.spines.surfaces import FrameSurfaces
 
 
 def noisy_points(mesh, count, seed=0):
@@ -68,7 +68,7 @@ def test_surfaces_that_were_kept_are_not_made_again(clouds, tmp_path, monkeypatc
     def fails(*_):
         raise AssertionError("made again")
 
-    monkeypatch.setattr(surfaces, "as_surface", fails)
+    monkeypatch.setattr(frame_surfaces, "as_surface", fails)
     again = FrameSurfaces.of_frames([*clouds, flat], workers=1, progress=tmp_path)
     assert all(torch.equal(first[number].vertices, again[number].vertices) for number in range(4))
     assert again.notes == first.notes

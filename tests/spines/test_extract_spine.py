@@ -12,8 +12,8 @@ from torchreg.errors import InputError, InputTypeError, SolverError
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rotation import so3_exp
 from torchreg.result import Status
-from torchreg.spines import frame_skeletons
 from torchreg.spines.extract_spine import SpineConfig, extract_spine
+from torchreg.spines.frames import frame_skeletons
 from torchreg.spines.results import SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.storage import load

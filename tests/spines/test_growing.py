@@ -9,11 +9,11 @@ from experiments.made_up.plants import PlantForm, growing_plant
 from torchreg.errors import InputError
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.extract_spine import SpineConfig, extract_spine
-from torchreg.spines.growing_limbs import growing_limbs
+from torchreg.spines.growth.growing_limbs import growing_limbs
+from torchreg.spines.growth.organ_graph import common_graph, limbs_between, restricted, shown_graph
+from torchreg.spines.growth.organ_tracks import OrganTracks, track_organs
 from torchreg.spines.labeled_tree import LimbGraph
-from torchreg.spines.organ_graph import common_graph, limbs_between, restricted, shown_graph
-from torchreg.spines.organ_tracks import OrganTracks, track_organs
-from torchreg.spines.tip_features import TipObservations
+from torchreg.spines.names.tip_features import TipObservations
 from torchreg.storage import load
 
 

@@ -8,9 +8,9 @@ import torch
 from torchreg.datasets.creatures import CreatureForm, creature_sequence
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
-from torchreg.spines.centering import centered_curves
-from torchreg.spines.clearance import Clearance, Inside
-from torchreg.spines.depth_field import DepthField, move_inside
+from torchreg.spines.limbs.depth_field import DepthField, move_inside
+from torchreg.spines.skeleton.centering import centered_curves
+from torchreg.spines.skeleton.clearance import Clearance, Inside
 
 
 def capsule():

@@ -12,11 +12,11 @@ from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.skeleton import build_skeleton
-from torchreg.spines import limb_transfer
 from torchreg.spines.labeled_tree import LimbGraph
-from torchreg.spines.limb_transfer import transfer_missing_limbs, transported_frames
-from torchreg.spines.local_icp import LocalFits, SurfacePoints, transfer_nodes
-from torchreg.spines.observed_limbs import median_lengths, observe_limbs, reject_odd_lengths, smooth_rough_limbs
+from torchreg.spines.limbs import limb_transfer
+from torchreg.spines.limbs.limb_transfer import transfer_missing_limbs, transported_frames
+from torchreg.spines.limbs.local_icp import LocalFits, SurfacePoints, transfer_nodes
+from torchreg.spines.limbs.observed_limbs import median_lengths, observe_limbs, reject_odd_lengths, smooth_rough_limbs
 
 STAR = LimbGraph(5, frozenset())
 FRAMES, SAMPLES = 5, 16

@@ -11,11 +11,11 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.geometry.rotation import so3_exp
 from torchreg.spines.extract_spine import extract_spine
-from torchreg.spines.name_chain import _best_path, _exchanged, _state_probabilities, name_over_time
-from torchreg.spines.name_model import relative_maps
-from torchreg.spines.student_t import TAILS, FeatureGroup, GroupedDensity, t_log_density
-from torchreg.spines.tip_features import TipFeatures, TipObservations
-from torchreg.spines.tip_relations import surface_relations
+from torchreg.spines.names.name_chain import _best_path, _exchanged, _state_probabilities, name_over_time
+from torchreg.spines.names.name_model import relative_maps
+from torchreg.spines.names.student_t import TAILS, FeatureGroup, GroupedDensity, t_log_density
+from torchreg.spines.names.tip_features import TipFeatures, TipObservations
+from torchreg.spines.skeleton.tip_relations import surface_relations
 from torchreg.storage import load
 
 

@@ -12,9 +12,9 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
 from torchreg.result import Status
-from torchreg.spines.clearance import Inside
 from torchreg.spines.extract_spine import SpineConfig, extract_spine
-from torchreg.spines.tip_tracking import track_tips
+from torchreg.spines.names.tip_tracking import track_tips
+from torchreg.spines.skeleton.clearance import Inside
 
 STAR, FORK = "(()()()()())", "((()())()())"
 FRAMES = 5

@@ -11,7 +11,7 @@ from torchreg.errors import FileWarning, InputError, InputTypeError
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rigid import rigid_matrix, se3_exp
-from torchreg.spines.clearance import Inside
+from torchreg.spines.skeleton.clearance import Inside
 from torchreg.spines.skeletonize import SkeletonizeConfig, skeletonize
 
 STAR = "(()()()()())"

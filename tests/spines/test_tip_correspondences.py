@@ -8,8 +8,8 @@ import torch
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, creature_sequence
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.skeleton import build_skeleton
-from torchreg.spines.tip_matching import TipReference, rank_mappings
-from torchreg.spines.tip_tracking import has_loops, most_frequent_count, track_tips
+from torchreg.spines.names.tip_matching import TipReference, rank_mappings
+from torchreg.spines.names.tip_tracking import has_loops, most_frequent_count, track_tips
 
 FRAMES = 8
 

@@ -9,9 +9,9 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.surface_graph import unique_edges
-from torchreg.spines.level_sets import MeshEdges, level_sets
-from torchreg.spines.loops import open_loops
-from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
+from torchreg.spines.skeleton.level_sets import MeshEdges, level_sets
+from torchreg.spines.skeleton.loops import open_loops
+from torchreg.spines.skeleton.protrusions import average_geodesic_distance, find_protrusions
 
 
 def brute_heights(graph, values):

@@ -9,9 +9,9 @@ import torch
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.isosurface import isosurface
 from torchreg.spines.labeled_tree import junctions_from_splits
-from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
-from torchreg.spines.limb_curves import JunctionBall, Rings, best_rings, largest_cost, limb_curve
-from torchreg.spines.tip_trees import (
+from torchreg.spines.skeleton.level_sets import LevelSets, MeshEdges, level_sets
+from torchreg.spines.skeleton.limb_curves import JunctionBall, Rings, best_rings, largest_cost, limb_curve
+from torchreg.spines.skeleton.tip_trees import (
     Branch,
     TipTree,
     consensus_junctions,

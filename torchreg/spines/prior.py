@@ -11,9 +11,9 @@ from torch import Tensor
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.labeled_tree import LimbGraph, path_lengths, skeleton_splits
-from torchreg.spines.observed_limbs import FrameLimbs, observe_limbs
+from torchreg.spines.limbs.observed_limbs import FrameLimbs, observe_limbs
+from torchreg.spines.names.tip_tracking import most_frequent_count
 from torchreg.spines.results import SpineSequence
-from torchreg.spines.tip_tracking import most_frequent_count
 
 
 @dataclass(frozen=True, eq=False)

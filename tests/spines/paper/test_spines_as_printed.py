@@ -13,11 +13,11 @@ from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.spines.labeled_tree import junctions_from_splits
-from torchreg.spines.level_sets import MeshEdges
 from torchreg.spines.paper.metanodes import metanode_junctions
 from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
 from torchreg.spines.paper.vertex_level_sets import vertex_level_sets
-from torchreg.spines.tip_trees import Branch, TipTree
+from torchreg.spines.skeleton.level_sets import MeshEdges
+from torchreg.spines.skeleton.tip_trees import Branch, TipTree
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.skeleton import nearest_rotation
-from torchreg.spines.body_mirror import BodyMirror, find_mirror
-from torchreg.spines.student_t import SHRINKAGE, TAILS, GroupedDensity, fit_groups, t_log_density
-from torchreg.spines.tip_features import SAMPLING, TipFeatures, TipObservations
+from torchreg.spines.names.body_mirror import BodyMirror, find_mirror
+from torchreg.spines.names.student_t import SHRINKAGE, TAILS, GroupedDensity, fit_groups, t_log_density
+from torchreg.spines.names.tip_features import SAMPLING, TipFeatures, TipObservations
 
 
 @dataclass(frozen=True)

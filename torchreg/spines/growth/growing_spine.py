@@ -10,18 +10,18 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
-from torchreg.spines.frame_notes import frame_notes, told_statuses
-from torchreg.spines.frame_skeletons import FrameSkeleton
-from torchreg.spines.growing_limbs import GrowingLimbs, growing_limbs
+from torchreg.spines.frames.frame_skeletons import FrameSkeleton
+from torchreg.spines.frames.frame_surfaces import FrameSurfaces
+from torchreg.spines.frames.frame_warnings import frame_notes, told_statuses
+from torchreg.spines.growth.growing_limbs import GrowingLimbs, growing_limbs
+from torchreg.spines.growth.organ_graph import common_graph, restricted, shown_tree
+from torchreg.spines.growth.organ_tracks import OrganTracks, track_organs
 from torchreg.spines.labeled_tree import LimbGraph
-from torchreg.spines.limb_transfer import transported_frames
-from torchreg.spines.observed_limbs import smooth_rough_limbs
-from torchreg.spines.organ_graph import common_graph, restricted, shown_tree
-from torchreg.spines.organ_tracks import OrganTracks, track_organs
+from torchreg.spines.limbs.limb_transfer import transported_frames
+from torchreg.spines.limbs.observed_limbs import smooth_rough_limbs
+from torchreg.spines.names.tip_features import observe_tips
 from torchreg.spines.results import SpineSequence
 from torchreg.spines.spine import Spine
-from torchreg.spines.surfaces import FrameSurfaces
-from torchreg.spines.tip_features import observe_tips
 
 _NO_TIP = -50.0  # log-odds that no place on tracks makes up for
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.spines.student_t import GroupedDensity
-from torchreg.spines.tip_features import TipFeatures, TipObservations
+from torchreg.spines.names.student_t import GroupedDensity
+from torchreg.spines.names.tip_features import TipFeatures, TipObservations
 
 
 @dataclass(frozen=True)

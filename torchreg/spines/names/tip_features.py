@@ -12,8 +12,8 @@ from torch import Tensor
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import arc_lengths, points_along
 from torchreg.spines.labeled_tree import path_lengths
-from torchreg.spines.student_t import FeatureGroup
-from torchreg.spines.tip_relations import TipRelations
+from torchreg.spines.names.student_t import FeatureGroup
+from torchreg.spines.skeleton.tip_relations import TipRelations
 
 
 @dataclass(frozen=True)

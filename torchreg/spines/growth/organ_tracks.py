@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.solvers.tracks import TrackGraph
-from torchreg.spines.name_model import PRIORS, mixture_scales
-from torchreg.spines.student_t import t_log_density
-from torchreg.spines.tip_features import TipObservations
+from torchreg.spines.names.name_model import PRIORS, mixture_scales
+from torchreg.spines.names.student_t import t_log_density
+from torchreg.spines.names.tip_features import TipObservations
 
 
 @dataclass(frozen=True)

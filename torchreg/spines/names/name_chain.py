@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchreg.solvers.assignment import assign
-from torchreg.spines.frame_workers import Job, do_jobs
-from torchreg.spines.name_model import PRIORS, NameModel, relative_maps
-from torchreg.spines.tip_features import TipObservations
+from torchreg.spines.frames.frame_workers import Job, do_jobs
+from torchreg.spines.names.name_model import PRIORS, NameModel, relative_maps
+from torchreg.spines.names.tip_features import TipObservations
 
 
 @dataclass(frozen=True)

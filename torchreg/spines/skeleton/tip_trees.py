@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchreg.geometry.graphs import Graph
 from torchreg.spines.labeled_tree import Tips, junctions_from_splits, without_tip_zero
-from torchreg.spines.level_sets import LevelSets
+from torchreg.spines.skeleton.level_sets import LevelSets
 
 # Triples of tips that say where a junction lies, at most; many tips make very many, and evenly spaced ones will do.
 _MAX_TRIPLES = 400

@@ -12,8 +12,8 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.graphs import Graph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.surface_graph import one_piece, unique_edges
-from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
-from torchreg.spines.protrusions import Protrusions
+from torchreg.spines.skeleton.level_sets import LevelSets, MeshEdges, level_sets
+from torchreg.spines.skeleton.protrusions import Protrusions
 
 
 @dataclass(frozen=True)
