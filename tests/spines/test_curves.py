@@ -25,7 +25,9 @@ def test_batches_equal_loops_and_similarities_change_what_they_must():
     for function, factor in ((curves.curve_lengths, 2.5), (curves.bend_angles, 1.0)):
         torch.testing.assert_close(function(batch)[1, 2], function(batch[1, 2]))
         torch.testing.assert_close(function(moved(batch, matrix)), factor * function(batch))
-    torch.testing.assert_close(curves.tangents(moved(batch, matrix)), curves.tangents(batch) @ (matrix[:3, :3] / 2.5).mT)
+    torch.testing.assert_close(
+        curves.tangents(moved(batch, matrix)), curves.tangents(batch) @ (matrix[:3, :3] / 2.5).mT
+    )
 
 
 def test_frames_are_rotations_along_the_curve_without_twist():

@@ -107,7 +107,11 @@ def test_missing_limbs_fragments_holes_wrong_winding_and_noise_are_borne(starfis
         (lambda _: tr.extract_spine(BALL), "InputTypeError", "got one mesh; put it into a list"),
         (lambda _: tr.extract_spine([BALL, "x"]), "InputTypeError", r"meshes\[1\] must be a TriangleMesh, got str"),
         (lambda _: tr.extract_spine(MeshesOnRequest([BALL, EMPTY])), "InputError", r"meshes\[1\] must have faces"),
-        (lambda _: tr.extract_spine([BALL, POINTS.repeat(10, 1)]), "InputError", r"\[1\] must hold 100 different .* 20"),
+        (
+            lambda _: tr.extract_spine([BALL, POINTS.repeat(10, 1)]),
+            "InputError",
+            r"\[1\] must hold 100 different .* 20",
+        ),
         (lambda _: tr.extract_spine([BALL], workers=0), "InputError", "workers must be at least 1"),
         (lambda _: tr.extract_spine([BALL], support="cut"), "InputError", "support must be"),
         (lambda _: tr.SpineConfig(num_tips=1), "InputError", "num_tips must be at least 2"),

@@ -115,7 +115,9 @@ def walking(body, num_frames, *, lift):
     frames, orders = [], []
     for number in range(num_frames):
         phase = torch.tensor(torch.pi * number / 4)
-        feet = [phase.sin().clamp_min(0), (-phase.sin()).clamp_min(0)] if lift else [(-1.0) ** number, -((-1) ** number)]
+        feet = (
+            [phase.sin().clamp_min(0), (-phase.sin()).clamp_min(0)] if lift else [(-1.0) ** number, -((-1) ** number)]
+        )
         up = torch.tensor([*feet, *[0.0] * (count - 2)]).double()
         shift = torch.stack((0 * up, 0.3 * up, 0.6 * up), 1) if lift else torch.stack((0 * up, 0 * up, 0.2 * up), 1)
         tips = roots + ends + shift
@@ -156,7 +158,11 @@ def test_a_mirror_gives_the_features_of_the_mirrored_frame_under_exchanged_names
     frame, mirrored = (
         TipObservations(random(5, 8, 3), distances + distances.mT, sign * cycled, random(5, 3)) for sign in (1, -1)
     )
-    kinds, names, usual = TipFeatures(5, 3, with_volumes=True), torch.tensor([[1, 0, 3, 2, 4]]), torch.zeros(10).double()
+    kinds, names, usual = (
+        TipFeatures(5, 3, with_volumes=True),
+        torch.tensor([[1, 0, 3, 2, 4]]),
+        torch.zeros(10).double(),
+    )
     columns, signs = body_mirror._images(kinds, names)
     features = kinds(frame, torch.arange(5)[None], usual)[0]
     torch.testing.assert_close(signs[0] * features[columns[0]], kinds(mirrored, names, usual)[0])
