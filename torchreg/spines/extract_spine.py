@@ -19,7 +19,7 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
 from torchreg.spines.frames.frame_skeletons import FrameSkeleton, skeletonize_frames
 from torchreg.spines.frames.frame_surfaces import FrameSurfaces
-from torchreg.spines.frames.frame_warnings import frame_notes, told_statuses
+from torchreg.spines.frames.frame_warnings import irregularities, statuses_and_warnings
 from torchreg.spines.frames.outlier_frames import check_sizes, frames_to_pass_over, with_frames_between
 from torchreg.spines.growth.growing_spine import growing_spine
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
@@ -225,9 +225,9 @@ def _joined_spine(
         topologies=tuple(topologies),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
         up=guess_up(surfaces.samples),
-        **told_statuses(
+        **statuses_and_warnings(
             [
-                frame_notes(*rows)
+                irregularities(*rows)
                 for rows in zip(skeletons, surfaces.notes, shown.sum(1).tolist(), ~shown, ~own, strict=True)
             ]
         ),

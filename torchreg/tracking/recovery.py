@@ -18,7 +18,7 @@ from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.pose_algebra import difference, shifted
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.tracking.evidence import is_doubtful, is_supported, lies_beside_data
+from torchreg.tracking.evidence import is_doubtful, is_supported, residual_too_large
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.motion_model import uncertainty_growth
@@ -99,11 +99,11 @@ class Recovery:
     def everywhere(self, state: TrackState, frame: Frame, repetitions: int = _PLAN.max_repetitions) -> FrameFit | None:
         """Return the fit of a search everywhere; of equivalent poses after a loss, that of the one nearest to the last.
 
-        A fit whose data lie beside the surface is no pose of the shape: the first search is repeated with more effort.
+        Where the data do not lie on the surface of a fit, the first search is repeated with more effort.
         """
         best = self._find(state, frame, FindPoseConfig(seed=state.seed))
         for number in range(1, repetitions + 1):
-            if state.lost or (best is not None and not lies_beside_data(best, state)):
+            if state.lost or (best is not None and not residual_too_large(best, state)):
                 break
             config = FindPoseConfig(
                 seed=state.seed + number,
@@ -119,7 +119,8 @@ class Recovery:
         data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
         seen = data if frame.picture is None else frame.picture
         starts = find_pose(
-            shape, seen, initializer=self.source.proposer, config=config, **frame.told, **frame.seen_keypoints
+            shape, seen, initializer=self.source.proposer, config=config,
+            **frame.prior_arguments, **frame.seen_keypoints,
         )  # fmt: skip
         poses = starts.poses
         if state.lost:

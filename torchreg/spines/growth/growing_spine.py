@@ -12,7 +12,7 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
 from torchreg.spines.frames.frame_skeletons import FrameSkeleton
 from torchreg.spines.frames.frame_surfaces import FrameSurfaces
-from torchreg.spines.frames.frame_warnings import frame_notes, told_statuses
+from torchreg.spines.frames.frame_warnings import irregularities, statuses_and_warnings
 from torchreg.spines.growth.growing_limbs import GrowingLimbs, growing_limbs
 from torchreg.spines.growth.organ_graph import common_graph, restricted, shown_tree
 from torchreg.spines.growth.organ_tracks import OrganTracks, track_organs
@@ -61,7 +61,7 @@ def growing_spine(
         up=guess_up(surfaces.samples),
         births=tracks.births,
         ends=tracks.ends,
-        **told_statuses(_notes(skeletons, surfaces.notes, tracks, limbs)),
+        **statuses_and_warnings(_notes(skeletons, surfaces.notes, tracks, limbs)),
     )
 
 
@@ -71,12 +71,14 @@ def _certainty(confidence: Tensor) -> Tensor:
 
 
 def _notes(
-    skeletons: Sequence[Skeleton], told: Sequence[tuple[str, ...]], tracks: OrganTracks, limbs: GrowingLimbs
+    skeletons: Sequence[Skeleton], notes: Sequence[tuple[str, ...]], tracks: OrganTracks, limbs: GrowingLimbs
 ) -> list[list[str]]:
     """Return the irregularities of the frames; what is not there is not missed."""
     shown = tracks.labels >= 0
     missing, transferred = tracks.alive & ~shown, limbs.present & ~limbs.observed
-    return [frame_notes(*row) for row in zip(skeletons, told, shown.sum(1).tolist(), missing, transferred, strict=True)]
+    return [
+        irregularities(*row) for row in zip(skeletons, notes, shown.sum(1).tolist(), missing, transferred, strict=True)
+    ]
 
 
 def _topology(graph: LimbGraph, alive: Tensor) -> str:

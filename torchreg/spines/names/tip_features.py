@@ -116,14 +116,14 @@ class TipFeatures:
         values = frame.geodesics[first.clamp_min(0), second.clamp_min(0)]
         return torch.where((first >= 0) & (second >= 0), values, torch.nan)
 
-    def __call__(self, frame: TipObservations, maps: Tensor, usual: Tensor) -> Tensor:
+    def __call__(self, frame: TipObservations, maps: Tensor, median_distances: Tensor) -> Tensor:
         """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN for missing tips.
 
-        Distances to missing tips are replaced by the usual ones between named tips, (K (K - 1) / 2,).
+        Distances to missing tips are replaced by the medians between named tips, (K (K - 1) / 2,).
         """
         index, found = maps.clamp_min(0), maps >= 0
         distances = self.distances(frame, maps)
-        complete = torch.where(distances.isnan(), usual, distances)
+        complete = torch.where(distances.isnan(), median_distances, distances)
         tips = torch.where(found, complete @ self._tip_terms, torch.nan)
         sides = torch.where(distances.isnan(), torch.nan, complete @ self._left_over)
         a, b, c = (index[:, column] for column in self.triples.unbind(1))
