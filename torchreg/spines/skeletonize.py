@@ -187,13 +187,9 @@ class _SurfaceTips:
     """The K tips of a body, two or more.
 
     Args:
-        positions: (K, 3).
         vertices: (K,) of the surface.
-        confidence: (K,).
         distances: (K, V) geodesic distances from them.
-        relations: of the tips along the surface.
         spacing: between levels of these distances, and so between nodes.
-        notes: for the skeleton.
     """
 
     positions: Tensor

@@ -46,8 +46,6 @@ class Frame:
         finite: (M,) True where a point is finite.
         elapsed: time since the frame before, in intervals.
         picture: whose points the cloud holds, if it is that of a depth camera.
-        known: locked and prior degrees of freedom, or None.
-        keypoints: that a detector saw, or None.
     """
 
     cloud: Tensor

@@ -53,12 +53,7 @@ _PLAN = RecoveryPlan()
 
 
 class Recovery:
-    """Attempts to explain a frame better than descent from the prediction did.
-
-    Args:
-        fitter: of the frames.
-        source: of poses where the shape is lost; the default of the shape by default.
-    """
+    """Attempts to explain a frame better than descent from the prediction did; ``source`` gives poses of a lost shape."""
 
     def __init__(self, fitter: FrameFitter, source: StartSource | None = None) -> None:
         self.fitter, self.level = fitter, fitter.config.recovery
@@ -67,14 +62,7 @@ class Recovery:
     def __call__(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
     ) -> tuple[FrameFit | None, TrackState]:
-        """Return the best fit of all attempts, None if the data do not support it, and the state after the attempts.
-
-        Args:
-            state: before the frame.
-            frame: the frame.
-            view: from the prediction, None without data in reach.
-            fit: by descent in the view.
-        """
+        """Return the best fit of all attempts, None if the data do not support it, and the state after the attempts."""
         if state.tracked:
             fit, state = self._around(state, frame, view, fit)
         else:

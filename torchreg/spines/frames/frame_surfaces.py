@@ -90,15 +90,12 @@ def _from_tensors(tensors: Mapping[str, Tensor], notes: Sequence[str]) -> _Surfa
 class FrameSurfaces(Sequence[TriangleMesh]):
     """The surfaces of frames.
 
-    Meshes are taken from their sequence when they are asked for, as from files, and are not kept; the surfaces of
-    clouds, which are expensive, are.
+    Meshes are read from their sequence on request and are not kept; the surfaces of clouds, which are expensive, are.
 
     Args:
         frames: meshes, or points without faces; any sequence.
         made: the surfaces of clouds by the number of the frame.
-        notes: on each frame.
         samples: some vertices of each frame, for its size and position.
-        shift: (3,) added to vertices; None for nothing.
         supports: what meshes stand on, which is cut off, by the number of the frame.
     """
 
@@ -120,10 +117,9 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         progress: str | os.PathLike[str] | None = None,
         support: str = "auto",
     ) -> FrameSurfaces:
-        """Return the surfaces of frames, each of which is taken when its turn comes.
+        """Return the surfaces of frames, read one by one; errors name the frame.
 
-        Errors name the frame. ``progress`` is a folder that keeps the surfaces of clouds for later calls; for
-        ``support`` see `split_support`.
+        ``progress`` is a folder that keeps the surfaces of clouds for later calls; for ``support`` see `split_support`.
         """
         check_choice(support, "support", SUPPORTS)
         if isinstance(frames, TriangleMesh):

@@ -23,9 +23,7 @@ class GrowingLimbs:
 
     Args:
         curves: (T, L, S, 3), without length where the limb does not exist.
-        radii: (T, L, S).
         observed: (T, L) True where the frame's own skeleton has the limb.
-        present: (T, L) True where it exists.
     """
 
     curves: Tensor

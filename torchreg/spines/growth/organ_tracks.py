@@ -45,8 +45,6 @@ class OrganTracks:
         labels: (T, K) index of each organ's tip in its frame, -1 where the frame lacks it.
         confidence: (T, K) probability that this is what became of its last tip; where the frame lacks it, that of the
             next one; NaN before its birth and after its end.
-        births: (K,) first frame of each organ.
-        ends: (K,) last frame of each organ.
     """
 
     labels: Tensor

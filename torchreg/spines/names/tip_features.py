@@ -35,8 +35,6 @@ class TipObservations:
 
     Args:
         curves: (M, S, 3) points of the limbs, from the tips towards the middle of the body.
-        geodesics: (M, M) distances along the surface.
-        volumes: (M, M, M), see `TipRelations`.
         limbs: (M, F) of each limb: the length to the middle, logarithms of radii.
     """
 

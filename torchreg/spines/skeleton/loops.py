@@ -29,12 +29,7 @@ _CUTTING = LoopCutting()
 
 @dataclass(frozen=True, eq=False)
 class OpenedLoops:
-    """A surface whose long loops are cut, closed again at the C cuts.
-
-    Args:
-        stumps: (C, 2, 3) centers of the two ends of each cut.
-        radii: (C,) half the length of the rim of each cut.
-    """
+    """A surface whose C long loops are cut and closed again: the two ends (C, 2, 3) of each, and half its rim (C,)."""
 
     mesh: TriangleMesh
     stumps: Tensor

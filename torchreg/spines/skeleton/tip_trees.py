@@ -21,12 +21,9 @@ _MAX_TRIPLES = 400
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A stretch of a tree between two points at which paths diverge.
+    """A stretch of a tree between points at which paths diverge: the tips beyond it, its rings (n,) from the root.
 
-    Args:
-        tips: those that lie beyond it, from the root.
-        rings: (n,) away from the root. The first is the ring in which the branch diverges from others (not so for the
-            branch that starts at the root), the last the one in which the paths to its tips diverge.
+    The first ring is that in which it diverges from others, the last that in which the paths to its tips diverge.
     """
 
     tips: Tips
