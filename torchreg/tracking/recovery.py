@@ -53,7 +53,7 @@ _PLAN = RecoveryPlan()
 
 
 class Recovery:
-    """Attempts to explain a frame better than descent from the prediction did; ``source`` gives poses of a lost shape."""
+    """Attempts to explain a frame better than descent from the prediction did; a source gives poses of a lost shape."""
 
     def __init__(self, fitter: FrameFitter, source: StartSource | None = None) -> None:
         self.fitter, self.level = fitter, fitter.config.recovery
