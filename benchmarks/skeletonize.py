@@ -40,7 +40,7 @@ from torchreg.datasets.creatures import OCTOPUS, STARFISH, creature_sequence
 from torchreg.datasets.figures import Figure
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.voxels import voxelize
-from torchreg.spines.clearance import Inside
+from torchreg.spines.skeleton.clearance import Inside
 
 RESOLUTION, STEADY_BAR, INSIDE_BAR, AXIS_BAR = 128, 0.70, 0.995, 0.10
 TIME_BAR, SEQUENCE_BAR, SEQUENCE_FRAMES = 5.0, 120.0, 44

@@ -60,7 +60,7 @@ from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.voxels import VoxelGrid, voxelize
 from torchreg.solvers.assignment import assign
-from torchreg.spines.clearance import Inside
+from torchreg.spines.skeleton.clearance import Inside
 
 # Voxels along the longest side for some 100,000 vertices, and frames that are timed.
 FINE_RESOLUTION, SPEED_FRAMES = 340, 12

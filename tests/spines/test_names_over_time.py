@@ -1,26 +1,18 @@
-"""Names of tips over a whole sequence at once: what surfaces tell, the most probable chain, and how sure it is."""
+"""Names of tips over a whole sequence: relations on the surface, the most probable chain, the mirror of a body."""
 
-from itertools import permutations, product
+from itertools import product
 
 import pytest
 import torch
 from scipy.stats import multivariate_t
 
-from torchreg.datasets.creatures import STARFISH, creature_sequence
+import torchreg as tr
+from tests.spines.bodies import moved, random, similarity
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.mesh import TriangleMesh, unit_sphere
-from torchreg.geometry.rotation import so3_exp
-from torchreg.spines.extract_spine import extract_spine
-from torchreg.spines.name_chain import _best_path, _exchanged, _state_probabilities, name_over_time
-from torchreg.spines.name_model import relative_maps
-from torchreg.spines.student_t import TAILS, FeatureGroup, GroupedDensity, t_log_density
-from torchreg.spines.tip_features import TipFeatures, TipObservations
-from torchreg.spines.tip_relations import surface_relations
-from torchreg.storage import load
-
-
-def random(*size, seed=0):
-    return torch.randn(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from torchreg.geometry.mesh import unit_sphere
+from torchreg.spines.names import body_mirror, name_chain, name_model, student_t
+from torchreg.spines.names.tip_features import TipFeatures, TipObservations
+from torchreg.spines.skeleton.tip_relations import surface_relations
 
 
 def relations(mesh, tips):
@@ -30,8 +22,7 @@ def relations(mesh, tips):
 
 def test_the_volume_of_three_distances_is_that_of_the_surface_that_they_map_to():
     ball = unit_sphere(3, dtype=torch.float64)
-    linear = random(3, 3) @ ball.vertices.mT
-    found = surface_relations(ball, linear, torch.tensor([0, 1, 2])).volumes
+    found = surface_relations(ball, random(3, 3) @ ball.vertices.mT, torch.tensor([0, 1, 2])).volumes
     volume = torch.linalg.det(ball.vertices[ball.faces]).sum() / 6
     assert float(found[0, 1, 2]) == pytest.approx(float(torch.linalg.det(random(3, 3)) * volume))
 
@@ -39,31 +30,29 @@ def test_the_volume_of_three_distances_is_that_of_the_surface_that_they_map_to()
 def test_relations_tell_a_body_from_its_mirror_image_and_not_its_pose_or_winding():
     ball = unit_sphere(3, dtype=torch.float64)
     bumpy = ball.vertices * (1 + 0.3 * (ball.vertices @ random(3, 1, seed=4)).sin())
-    mesh, tips = TriangleMesh(bumpy, ball.faces), bumpy[[3, 40, 77, 120]]
-    found = relations(mesh, tips)
+    mesh, tips, matrix = tr.TriangleMesh(bumpy, ball.faces), bumpy[[3, 40, 77, 120]], similarity(2, 2.0)
+    found, mirror = relations(mesh, tips), torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     assert float(found.volumes.abs().max()) > 1e-3
     torch.testing.assert_close(found.volumes, -found.volumes.transpose(0, 1))
-    torch.testing.assert_close(relations(TriangleMesh(bumpy, ball.faces.flip(1)), tips).volumes, found.volumes)
-    turn = so3_exp(random(3, seed=2))
-    moved = relations(TriangleMesh(2 * bumpy @ turn.mT + 3, ball.faces), 2 * tips @ turn.mT + 3)
-    torch.testing.assert_close(moved.volumes, 8 * found.volumes)
-    mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(
-        relations(TriangleMesh(mirror * bumpy, ball.faces), mirror * tips).volumes, -found.volumes
-    )
+    for vertices, faces, ends, factor in (
+        (bumpy, ball.faces.flip(1), tips, 1),
+        (moved(bumpy, matrix), ball.faces, moved(tips, matrix), 8),
+        (mirror * bumpy, ball.faces, mirror * tips, -1),
+    ):
+        again = relations(tr.TriangleMesh(vertices, faces), ends).volumes
+        torch.testing.assert_close(again, factor * found.volumes)
     order = torch.tensor([2, 0, 3, 1])
     torch.testing.assert_close(found.of_tips(order).volumes, relations(mesh, tips[order]).volumes)
 
 
 def test_densities_are_those_of_scipy():
-    spread = random(4, 4)
-    covariance, points = spread @ spread.mT, random(6, 5, seed=1)
-    density = GroupedDensity([FeatureGroup(torch.arange(4), 4)], [covariance])
-    wanted = multivariate_t(shape=covariance.numpy(), df=TAILS.dof).logpdf(points[:, :4].numpy())
+    spread, points = random(4, 4), random(6, 5, seed=1)
+    covariance, tails = spread @ spread.mT, student_t.TAILS
+    density = student_t.GroupedDensity([student_t.FeatureGroup(torch.arange(4), 4)], [covariance])
+    wanted = multivariate_t(shape=covariance.numpy(), df=tails.dof).logpdf(points[:, :4].numpy())
     torch.testing.assert_close(density(points)[:, 0], torch.from_numpy(wanted))
-    scale = torch.tensor(0.3, dtype=torch.float64)
-    wanted = multivariate_t(shape=0.09 * torch.eye(3).double().numpy(), df=TAILS.displacement_dof)
-    found = t_log_density(points[:, :3].square().sum(-1), scale, 3)
+    wanted = multivariate_t(shape=0.09 * torch.eye(3).double().numpy(), df=tails.displacement_dof)
+    found = student_t.t_log_density(points[:, :3].square().sum(-1), torch.tensor(0.3).double(), 3)
     torch.testing.assert_close(found, torch.from_numpy(wanted.logpdf(points[:, :3].numpy())))
 
 
@@ -71,84 +60,124 @@ def test_the_best_chain_and_the_chances_of_its_states_are_those_of_all_chains():
     start, steps = random(3), [random(3, 4, seed=1), random(4, 2, seed=2), random(2, 3, seed=3)]
     chains = list(product(range(3), range(4), range(2), range(3)))
     scores = torch.stack([start[c[0]] + sum(step[c[k], c[k + 1]] for k, step in enumerate(steps)) for c in chains])
-    path, score = _best_path(start, steps)
+    path, score = name_chain._best_path(start, steps)
     assert tuple(path) == chains[int(scores.argmax())]
     assert score == pytest.approx(float(scores.max()))
     chances = scores.softmax(0)
-    for place, found in enumerate(_state_probabilities(start, steps)):
+    for place, found in enumerate(name_chain._state_probabilities(start, steps)):
         wanted = torch.zeros_like(found).index_add(0, torch.tensor([c[place] for c in chains]), chances)
         torch.testing.assert_close(found, wanted)
 
 
 def test_names_one_step_away_are_all_that_differ_by_an_exchange_or_one_tip():
-    names = torch.tensor([[2, 0, -1]])
-    found = {tuple(row) for row in _exchanged(names, 4).tolist()}
+    names = (2, 0, -1)
+    found = {tuple(row) for row in name_chain._exchanged(torch.tensor([names]), 4).tolist()}
     every = {row for row in product(range(-1, 4), repeat=3) if len([k for k in row if k >= 0]) == len({*row} - {-1})}
-    swaps = {
-        tuple(names[0, list(order)].tolist())
-        for order in permutations(range(3))
-        if sum(k != place for place, k in enumerate(order)) == 2
-    }
-    moves = {row for row in every if sum(a != b for a, b in zip(row, names[0].tolist(), strict=True)) <= 1}
-    assert found == swaps | moves
+    moves = {row for row in every if sum(a != b for a, b in zip(row, names, strict=True)) <= 1}
+    assert found == moves | {(0, 2, -1), (-1, 0, 2), (2, -1, 0)}
 
 
-def test_tips_follow_their_names_from_frame_to_frame():
-    before, after = torch.tensor([[2, 0, -1], [1, 2, 0]]), torch.tensor([[0, 1, 2]])
-    assert relative_maps(before, after, 3).tolist() == [[[1, -1, 0]], [[2, 0, 1]]]
-
-
-def test_what_is_left_of_distances_does_not_feel_where_the_end_of_a_limb_lies():
+def test_residuals_of_distances_do_not_depend_on_where_the_end_of_a_limb_lies():
     features = TipFeatures(5, 1, with_volumes=False)
     distances = random(5, 5, seed=3).abs()
-    distances = distances + distances.mT
-    shift = torch.zeros(5).double()
-    shift[2] = 0.7
-    moved = distances + shift[:, None] + shift
-    maps = torch.arange(5)[None]
+    shift = torch.tensor([0.0, 0, 0.7, 0, 0]).double()
 
     def of(rows):
-        frame = TipObservations(
-            torch.zeros(5, 8, 3).double(), rows, torch.zeros(5, 5, 5).double(), torch.zeros(5, 1).double()
-        )
-        return features(frame, maps, torch.zeros(10).double())[0]
+        zeros = (torch.zeros(5, 8, 3).double(), rows, torch.zeros(5, 5, 5).double(), torch.zeros(5, 1).double())
+        return features(TipObservations(*zeros), torch.arange(5)[None], torch.zeros(10).double())[0]
 
-    change = of(moved) - of(distances)
+    change = of(distances + distances.mT + shift[:, None] + shift) - of(distances + distances.mT)
     torch.testing.assert_close(change[:5], shift)
     assert float(change[5:].abs().max()) < 1e-12
 
 
-def crossing_legs(num_frames):
-    """Feet that pass each other between frames, told by their distances to two hands; and the orders of the tips."""
-    wanted = torch.tensor([[0, 2.0, 1.0, 1.2], [2.0, 0, 1.2, 1.0], [1.0, 1.2, 0, 1.5], [1.2, 1.0, 1.5, 0]]).double()
-    roots = torch.tensor([[-0.1, 0, 0.0], [0.1, 0, 0], [-0.3, 0, 1], [0.3, 0, 1]]).double()
-    share, frames, orders = torch.linspace(0, 1, 8).double()[:, None], [], []
+CROSSED = {
+    "distances": [[0, 2.0, 1.0, 1.2], [2.0, 0, 1.2, 1.0], [1.0, 1.2, 0, 1.5], [1.2, 1.0, 1.5, 0]],
+    "roots": [[-0.1, 0, 0.0], [0.1, 0, 0], [-0.3, 0, 1], [0.3, 0, 1]],
+    "ends": [[0.0, -0.8, 0]] * 4,
+}
+LIFTED = {
+    "distances": [[0, 1.0, 1.5, 1.55, 1.7], [1.0, 0, 1.55, 1.5, 1.7], [1.5, 1.55, 0, 1.3, 1.0],
+                  [1.55, 1.5, 1.3, 0, 1.0], [1.7, 1.7, 1.0, 1.0, 0]],
+    "roots": [[-0.1, 0, 0], [0.1, 0, 0], [-0.2, 0, 0.6], [0.2, 0, 0.6], [0, 0, 0.7]],
+    "ends": [[0.08, 0, -0.8], [-0.08, 0, -0.8], [-0.3, 0, -0.5], [0.3, 0, -0.5], [0, 0, 0.2]],
+}  # fmt: skip
+
+
+def walking(body, num_frames, *, lift):
+    """Frames of a body of which only distances between tips are measured, and the shuffled orders of the tips.
+
+    Two feet pass each other from frame to frame, or are lifted in turn, which brings them near the other tips.
+    """
+    wanted, roots, ends = (torch.tensor(body[name]).double() for name in ("distances", "roots", "ends"))
+    count = len(roots)
+    usual = torch.tensor([-2.0, -2, -2.5, -2.5, -1.5]).double()[:count]
+    frames, orders = [], []
     for number in range(num_frames):
-        stride = 0.2 * (-1) ** number * torch.tensor([1.0, -1, 0, 0]).double()
-        tips = roots + torch.stack((torch.zeros(4), torch.full((4,), -0.8), stride), 1).double()
-        curves = tips[:, None] + share * (roots - tips)[:, None] + 0.01 * random(4, 8, 3, seed=number)
-        noise = 0.01 * random(4, 4, seed=50 + number)
-        order = torch.randperm(4, generator=torch.Generator().manual_seed(number))
-        distances = (wanted + noise + noise.mT)[order][:, order]
-        orders.append(order)
-        frames.append(
-            TipObservations(curves[order], distances, torch.zeros(4, 4, 4).double(), torch.zeros(4, 1).double())
+        phase = torch.tensor(torch.pi * number / 4)
+        feet = (
+            [phase.sin().clamp_min(0), (-phase.sin()).clamp_min(0)] if lift else [(-1.0) ** number, -((-1) ** number)]
         )
+        up = torch.tensor([*feet, *[0.0] * (count - 2)]).double()
+        shift = torch.stack((0 * up, 0.3 * up, 0.6 * up), 1) if lift else torch.stack((0 * up, 0 * up, 0.2 * up), 1)
+        tips = roots + ends + shift
+        curves = tips[:, None] + torch.linspace(0, 1, 8).double()[:, None] * (roots - tips)[:, None]
+        noise = 0.003 * random(count, count, seed=number) - (0.15 * up if lift else 0)
+        limbs = torch.stack((wanted.mean(1) - (0.3 * up if lift else 0), usual), 1) + 0.01 * random(count, 2)
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(number))
+        distances = (wanted + noise + noise.mT).fill_diagonal_(0)[order][:, order]
+        frames.append(TipObservations(curves[order], distances, torch.zeros(3 * [count]).double(), limbs[order]))
+        orders.append(order)
     return frames, orders
 
 
-def test_legs_that_pass_each_other_keep_their_names_in_any_order_of_tips():
-    frames, orders = crossing_legs(9)
-    found = name_over_time(frames, 4, torch.arange(4))
+@pytest.mark.parametrize(("body", "lift", "reference"), [(CROSSED, False, 4), (LIFTED, True, 2)])
+def test_legs_keep_their_names_in_any_order_of_tips(body, lift, reference):
+    frames, orders = walking(body, 9, lift=lift)
+    found = name_chain.name_over_time(frames, reference, torch.arange(len(body["roots"])))
     names = torch.stack([order[row] for order, row in zip(orders, found.labels, strict=True)])
-    assert bool((names == orders[4]).all())
-    assert bool((found.confidence > 0.5).all())
-    assert bool((found.confidence[4] == 1).all())
+    assert bool((names == orders[reference]).all())
+    assert bool((found.confidence[reference] == 1).all())
+    assert bool((found.confidence > 0.5).all()) or lift
 
 
-def test_confidence_of_a_spine_has_a_value_for_every_tip_and_frame_and_is_kept(tmp_path):
-    spine = extract_spine(creature_sequence(STARFISH, 3, resolution=32).meshes, workers=1)
-    assert spine.confidence.shape == spine.found.shape
-    assert bool(((spine.confidence > 0.5) & (spine.confidence <= 1)).all())
-    spine.save(tmp_path / "spine.safetensors")
-    assert torch.equal(load(tmp_path / "spine.safetensors").confidence, spine.confidence)
+@pytest.mark.parametrize(("count", "number"), [(3, 4), (5, 26), (6, 76)])
+def test_exchanges_are_all_permutations_that_undo_themselves(count, number):
+    rows = torch.tensor(list(body_mirror._exchanges(list(range(count)), 0)))
+    assert rows[0].tolist() == list(range(count))
+    assert len(rows.unique(dim=0)) == len(rows) == number
+    assert bool((rows.gather(1, rows) == torch.arange(count)).all())
+
+
+def test_a_mirror_gives_the_features_of_the_mirrored_frame_under_exchanged_names():
+    distances, volumes = random(5, 5).abs(), random(5, 5, 5, seed=1)
+    for first, second in ((0, 1), (1, 2), (0, 1)):
+        volumes = volumes - volumes.transpose(first, second)
+    cycled = sum(volumes.permute(*order) for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)))
+    cycled = cycled - cycled.transpose(0, 1)
+    frame, mirrored = (
+        TipObservations(random(5, 8, 3), distances + distances.mT, sign * cycled, random(5, 3)) for sign in (1, -1)
+    )
+    kinds, names, usual = (
+        TipFeatures(5, 3, with_volumes=True),
+        torch.tensor([[1, 0, 3, 2, 4]]),
+        torch.zeros(10).double(),
+    )
+    columns, signs = body_mirror._images(kinds, names)
+    features = kinds(frame, torch.arange(5)[None], usual)[0]
+    torch.testing.assert_close(signs[0] * features[columns[0]], kinds(mirrored, names, usual)[0])
+
+
+def test_the_mirror_of_a_body_is_found_and_limbs_that_are_all_alike_have_none():
+    frames, orders = walking(LIFTED, 9, lift=True)
+    names, kinds = torch.stack([order.argsort() for order in orders]), TipFeatures(5, 2, with_volumes=False)
+    names[3, :2] = names[3, [1, 0]].clone()  # a wrong name does not matter
+    names[4, 2] = -1
+    found = body_mirror.find_mirror(kinds, name_model._background(kinds, frames)[1], frames, names)
+    assert found.names.tolist() == [1, 0, 3, 2, 4]
+    alike = [
+        TipObservations(row.curves, 1 + 0.02 * (d + d.mT), row.volumes, 1 + 0.02 * random(5, 2, seed=k))
+        for k, row in enumerate(frames)
+        for d in [random(5, 5, seed=k)]
+    ]
+    assert body_mirror.find_mirror(kinds, name_model._background(kinds, alike)[1], alike, names) is None

@@ -5,10 +5,8 @@ import math
 import pytest
 import torch
 
-from torchreg.errors import InputError, InputTypeError
+import torchreg as tr
 from torchreg.geometry.rotation import so3_exp
-from torchreg.spines.curves import tangents
-from torchreg.spines.spine import Spine
 
 GRAPH = torch.tensor([[0, 4], [1, 4], [2, 5], [3, 5], [4, 5]])  # four tips, two junctions
 
@@ -26,7 +24,7 @@ def made_curves(count=4, samples=7, seed=0):
 def spine():
     curves = made_curves()
     radii = torch.full(curves.shape[:3], 0.1, dtype=torch.float64) * torch.arange(1, 5)[:, None, None]
-    return Spine(curves, GRAPH, radii, times=torch.tensor([0.0, 1.0, 3.0, 4.0]))
+    return tr.Spine(curves, GRAPH, radii, times=torch.tensor([0.0, 1.0, 3.0, 4.0]))
 
 
 def test_the_frames_are_met_exactly(spine):
@@ -41,7 +39,7 @@ def test_motion_at_even_speed_and_under_even_acceleration_is_met_between_the_fra
     times = torch.tensor([0.0, 1.0, 3.0, 4.0], dtype=torch.float64)
     path = (times + 0.5 * times**2)[:, None, None, None]
     shape = made_curves(1)
-    spine = Spine(shape + path, GRAPH, times=times)
+    spine = tr.Spine(shape + path, GRAPH, times=times)
     for t in (1.5, 2.0, 2.9):
         torch.testing.assert_close(spine(t), shape[0] + t + 0.5 * t**2)
 
@@ -71,24 +69,14 @@ def test_many_times_at_once_equal_one_after_the_other(spine):
 def test_frames_of_the_limbs_follow_the_curves_and_turn_with_the_body():
     curves = made_curves(1) * torch.tensor([1.0, 1.0, 0.0])
     turn = so3_exp(torch.tensor([0.0, 0.0, math.pi / 3], dtype=torch.float64))
-    first = Spine(curves, GRAPH).rest_frames
-    spine = Spine(torch.cat((curves, curves @ turn.mT)), GRAPH, frames=torch.cat((first, turn @ first)))
+    first = tr.Spine(curves, GRAPH).rest_frames
+    spine = tr.Spine(torch.cat((curves, curves @ turn.mT)), GRAPH, frames=torch.cat((first, turn @ first)))
     half = so3_exp(torch.tensor([0.0, 0.0, math.pi / 6], dtype=torch.float64))
     frames = spine.frames(0.5)
-    torch.testing.assert_close(frames[..., 2], tangents(spine(0.5)))
+    ahead = torch.nn.functional.normalize(spine(0.5)[:, 2:] - spine(0.5)[:, :-2], dim=-1)
+    assert float((frames[:, 1:-1, :, 2] * ahead).sum(-1).detach().min()) > 0.99
     torch.testing.assert_close(frames @ frames.mT, torch.eye(3, dtype=torch.float64).expand_as(frames))
     torch.testing.assert_close(frames, half @ first[0])
-
-
-def test_lengths_and_bend_angles_are_those_of_the_curves():
-    straight = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None] * torch.tensor([3.0, 4.0, 0.0])
-    bent = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]], dtype=torch.float64)
-    spine = Spine(straight[None, None], torch.tensor([[0, 1]]))
-    assert float(spine.lengths(0.0).detach()) == pytest.approx(5.0)
-    torch.testing.assert_close(spine.bend_angles(0.0), torch.zeros(1, 3, dtype=torch.float64))
-    torch.testing.assert_close(
-        Spine(bent[None, None], torch.tensor([[0, 1]])).bend_angles(0.0), torch.tensor([[math.pi / 2]]).double()
-    )
 
 
 def test_gradients_are_right_in_time_and_nodes(spine):
@@ -103,55 +91,38 @@ def test_gradients_are_right_in_time_and_nodes(spine):
     assert bool(spine.nodes.grad.isfinite().all())
 
 
-def test_a_loss_moves_the_curves_to_their_target(spine):
-    target = made_curves(seed=5)
-    optimizer = torch.optim.Adam(spine.parameters(), lr=0.1)
-    for _ in range(150):
-        optimizer.zero_grad()
-        loss = (spine(spine.times) - target).square().mean()
-        loss.backward()
-        optimizer.step()
-    assert float(loss.detach()) < 1e-3
-
-
 def test_a_single_frame_stands_still():
-    spine = Spine(made_curves(1).float(), GRAPH)
+    spine = tr.Spine(made_curves(1).float(), GRAPH)
     assert spine(0.0).dtype == torch.float32
     torch.testing.assert_close(spine(0.0), made_curves(1).float()[0])
     assert spine.frames(0.0).shape == (5, 7, 3, 3)
     assert spine.radii(0.0).shape == (5, 7)
 
 
-def test_states_are_saved_and_loaded(spine):
-    loaded = Spine(made_curves(seed=3), GRAPH, times=spine.times)
-    loaded.load_state_dict(spine.state_dict())
-    assert torch.equal(loaded(2.2), spine(2.2))
-
-
 @pytest.mark.parametrize(
-    ("change", "error", "message"),
+    ("change", "error", "words"),
     [
-        ({"curves": torch.zeros(2, 5, 1, 3)}, InputError, "two points at least"),
-        ({"curves": torch.zeros(5, 7, 3)}, InputError, "curves must have shape"),
-        ({"curves": torch.full((1, 5, 3, 3), torch.nan)}, InputError, "curves must be finite"),
-        ({"graph": GRAPH[:4]}, InputError, "graph must have shape"),
-        ({"graph": GRAPH.double()}, InputTypeError, "graph must hold integers"),
-        ({"graph": GRAPH + 1}, InputError, "graph must hold the nodes 0 to 5"),
-        ({"graph": torch.tensor([[0, 4], [1, 4], [0, 1], [2, 3], [5, 2]])}, InputError, "must be a tree"),
-        ({"graph": 5 - GRAPH}, InputError, "tips first"),
-        ({"graph": GRAPH[[0, 2, 1, 3, 4]]}, InputError, "must meet where graph says"),
-        ({"radii": torch.zeros(4, 5, 6)}, InputError, "radii must have shape"),
-        ({"frames": torch.zeros(4, 5, 7, 3)}, InputError, "frames must have shape"),
-        ({"times": torch.tensor([0.0, 1.0, 1.0, 2.0])}, InputError, "times must increase strictly"),
+        ({"curves": torch.zeros(2, 5, 1, 3)}, "InputError", "two points at least"),
+        ({"curves": torch.zeros(5, 7, 3)}, "InputError", "curves must have shape"),
+        ({"curves": torch.full((1, 5, 3, 3), torch.nan)}, "InputError", "curves must be finite"),
+        ({"graph": GRAPH[:4]}, "InputError", "graph must have shape"),
+        ({"graph": GRAPH.double()}, "InputTypeError", "graph must hold integers"),
+        ({"graph": GRAPH + 1}, "InputError", "graph must hold the nodes 0 to 5"),
+        ({"graph": torch.tensor([[0, 4], [1, 4], [0, 1], [2, 3], [5, 2]])}, "InputError", "must be a tree"),
+        ({"graph": 5 - GRAPH}, "InputError", "tips first"),
+        ({"graph": GRAPH[[0, 2, 1, 3, 4]]}, "InputError", "must meet where graph says"),
+        ({"radii": torch.zeros(4, 5, 6)}, "InputError", "radii must have shape"),
+        ({"frames": torch.zeros(4, 5, 7, 3)}, "InputError", "frames must have shape"),
+        ({"times": torch.tensor([0.0, 1.0, 1.0, 2.0])}, "InputError", "times must increase strictly"),
     ],
 )
-def test_bad_input_is_named(change, error, message):
-    with pytest.raises(error, match=message):
-        Spine(**{"curves": made_curves(), "graph": GRAPH, **change})
+def test_bad_input_is_named(change, error, words):
+    with pytest.raises(getattr(tr.errors, error), match=words):
+        tr.Spine(**{"curves": made_curves(), "graph": GRAPH, **change})
 
 
 def test_times_outside_are_refused(spine):
-    with pytest.raises(InputError, match=r"t must lie within the times 0.0 to 4.0"):
+    with pytest.raises(tr.errors.InputError, match=r"t must lie within the times 0.0 to 4.0"):
         spine(4.5)
 
 
@@ -159,7 +130,7 @@ def test_the_record_makes_the_same_spine_again_also_after_a_step(spine):
     with torch.no_grad():
         spine.nodes += 0.1
         spine.node_radii *= 2
-    again = Spine.from_record(spine.record())
+    again = tr.Spine.from_record(spine.record())
     for name in ("nodes", "node_radii", "rest_frames", "times", "graph"):
         assert torch.equal(getattr(again, name), getattr(spine, name))
 

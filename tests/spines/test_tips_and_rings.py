@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
+import torchreg as tr
+from tests.spines.bodies import circle, random, tube
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.isosurface import isosurface
-from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
-from torchreg.geometry.surface_graph import unique_edges
-from torchreg.spines.level_sets import MeshEdges, level_sets
-from torchreg.spines.loops import open_loops
-from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
+from torchreg.geometry.mesh import concatenate, unit_sphere
+from torchreg.spines.skeleton.level_sets import MeshEdges, level_sets
+from torchreg.spines.skeleton.loops import open_loops
+from torchreg.spines.skeleton.protrusions import average_geodesic_distance, find_protrusions
 
 
 def brute_heights(graph, values):
@@ -40,7 +40,7 @@ def brute_heights(graph, values):
 @pytest.mark.parametrize("seed", range(3))
 def test_heights_are_those_of_a_flood(seed):
     graph = GeodesicGraph.from_mesh(unit_sphere(2, dtype=torch.float64))
-    values = torch.randn(162, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    values = random(162, seed=seed)
     if seed == 2:
         values = (2 * values).round()
     found = find_protrusions(graph, values, 1e-9)
@@ -105,34 +105,20 @@ def test_rings_do_not_depend_on_how_dense_the_vertices_are():
     after = (column + 1) % count
     faces = torch.stack((row + column, row + after, row + count + column), dim=1)
     faces = torch.cat((faces, torch.stack((row + after, row + count + after, row + count + column), dim=1)))
-    sets = level_sets(MeshEdges(TriangleMesh(positions, faces)), positions[:, 2], 0.7)
+    sets = level_sets(MeshEdges(tr.TriangleMesh(positions, faces)), positions[:, 2], 0.7)
     assert len(sets) == 15
     assert sets.centers[:, :2].abs().max() < 0.005
     assert ring.mean(0).norm() > 0.2
 
 
 def test_rings_join_bands_in_a_tree_on_a_sphere_and_in_a_loop_on_a_torus():
-    for mesh, loops in ((unit_sphere(3, dtype=torch.float64), 0), (torus(), 1)):
+    for mesh, loops in ((unit_sphere(3, dtype=torch.float64), 0), (tori([0.0]), 1)):
         sets = level_sets(MeshEdges(mesh), mesh.vertices[:, 0], 0.21)
         assert len(sets) - sets.num_bands + 1 == loops
         steps = torch.floor(mesh.vertices[:, 0] / 0.21).long()
         for band, level in ((sets.lower, sets.levels - 1), (sets.upper, sets.levels)):
             for number, step in zip(band.tolist(), level.tolist(), strict=True):
                 assert set(steps[sets.vertex_bands == number].tolist()) <= {step}
-
-
-def torus(rows=48, columns=24, radius=0.35):
-    u = (torch.arange(rows) * 2 * math.pi / rows).double()[:, None]
-    v = (torch.arange(columns) * 2 * math.pi / columns).double()[None]
-    distance = 1 + radius * v.cos()
-    positions = torch.stack(
-        (distance * u.cos(), distance * u.sin(), radius * v.sin().expand(rows, -1)), dim=-1
-    ).reshape(-1, 3)
-    a = torch.arange(rows)[:, None] * columns + torch.arange(columns)
-    b, c = a.roll(-1, 0), a.roll(-1, 1)
-    d = b.roll(-1, 1)
-    faces = torch.cat((torch.stack((a, b, c), -1).reshape(-1, 3), torch.stack((b, d, c), -1).reshape(-1, 3)))
-    return TriangleMesh(positions, faces)
 
 
 def test_triangles_that_span_many_levels_have_a_ring_on_each():
@@ -154,39 +140,25 @@ def test_faces_of_a_ring_are_those_that_it_passes_through():
     assert bool(((corners.amin(1) < 0.3) & (corners.amax(1) >= 0.3)).all())
 
 
-def test_pieces_and_fins_are_fine():
+def test_pieces_and_fins_are_fine_and_a_constant_function_has_no_rings():
     ball = unit_sphere(2, dtype=torch.float64)
-    mesh = concatenate([ball, TriangleMesh(ball.vertices + 3, ball.faces)])
-    faces = torch.cat((mesh.faces, mesh.faces[:1, [0, 1, 0]] * 0 + torch.tensor([[0, 1, 200]])))
-    sets = level_sets(MeshEdges(TriangleMesh(mesh.vertices, faces)), mesh.vertices[:, 2], 0.5)
-    assert len(sets) > 6
+    mesh = concatenate([ball, tr.TriangleMesh(ball.vertices + 3, ball.faces)])
+    faces = torch.cat((mesh.faces, torch.tensor([[0, 1, 200]])))
+    assert len(level_sets(MeshEdges(tr.TriangleMesh(mesh.vertices, faces)), mesh.vertices[:, 2], 0.5)) > 6
+    assert len(level_sets(MeshEdges(mesh), 0 * mesh.vertices[:, 0], 1.0)) == 0
 
 
-def test_a_constant_function_has_no_rings():
-    mesh = unit_sphere(0, dtype=torch.float64)
-    assert len(level_sets(MeshEdges(mesh), torch.zeros(12, dtype=torch.float64), 1.0)) == 0
-
-
-def tori(centers, thin=0.12, thick=0.3):
+def tori(centers):
     """Return rings of radius 1 in the plane z = 0, thinnest at their largest x, that may overlap."""
-
-    def field(points):
-        parts = []
-        for x in centers:
-            flat = points[:, :2] - torch.tensor([x, 0.0], dtype=points.dtype)
-            radius = flat.norm(dim=1)
-            share = 0.5 + 0.5 * flat[:, 0] / radius.clamp(min=1e-9)
-            around = torch.stack((radius - 1, points[:, 2]), dim=1).norm(dim=1)
-            parts.append(around - (thick + (thin - thick) * share**4))
-        return torch.stack(parts).amin(0)
-
-    low, high = min(centers) - 1.5, max(centers) + 1.5
-    lower, upper = torch.tensor([low, -1.5, -0.5]).double(), torch.tensor([high, 1.5, 0.5]).double()
-    return isosurface(field, lower, upper, 0.1)
+    ring = circle()[:-1]
+    radii = 0.3 - 0.18 * (0.5 + 0.5 * ring[:, 0]) ** 4
+    axes = torch.cat([ring + torch.tensor([x, 0.0, 0.0]) for x in centers])
+    return tube(axes, radii.repeat(len(centers)), 0.1)
 
 
 def euler_number(mesh):
-    return mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces
+    """Return V - E + F of a closed mesh."""
+    return mesh.num_vertices - mesh.num_faces // 2
 
 
 def test_a_ring_is_cut_where_it_is_thinnest():
@@ -201,18 +173,14 @@ def test_a_ring_is_cut_where_it_is_thinnest():
     assert float(opened.radii) == pytest.approx(math.pi * 0.12, rel=0.3)
 
 
-def test_every_long_loop_is_cut():
+def test_every_long_loop_is_cut_and_short_ones_and_surfaces_without_any_stay_as_they_are():
     mesh = tori([0.0, 2.0])
     assert euler_number(mesh) == -2
     opened = open_loops(mesh, 0.1, 100)
     assert euler_number(opened.mesh) == 2
     assert len(opened.stumps) == 2
-
-
-def test_short_loops_and_surfaces_without_any_stay_as_they_are():
-    mesh = tori([0.0])
-    assert open_loops(mesh, 3.0, 100).mesh is mesh
+    assert open_loops(mesh, 6.0, 100).mesh is mesh
     ball = unit_sphere(2, dtype=torch.float64)
-    opened = open_loops(TriangleMesh(ball.vertices, ball.faces), 0.1, 100)
+    opened = open_loops(tr.TriangleMesh(ball.vertices, ball.faces), 0.1, 100)
     assert opened.mesh.faces is ball.faces
     assert opened.stumps.shape == (0, 2, 3)

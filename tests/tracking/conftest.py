@@ -6,15 +6,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import torchreg as tr
 import torchreg.tracking.recovery as recovery
-from torchreg.alignment.results import PoseStarts
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.geometry.sampling import farthest_points
-from torchreg.shapes.skin import sample_skin
 from torchreg.tracking.frame import Frame
 from torchreg.tracking.frame_fit import FrameFitter
-from torchreg.tracking.tracker import TrackConfig, Tracker
 
 FRAMES = 8
 TIPS = [4, 8, 12, 16, 20]
@@ -27,11 +25,11 @@ def arm_tracking(arm):
     pose = torch.tensor([0.3, -0.2, 0.8, 0.4, 0.2, -0.5, 0.7], dtype=torch.float64)
     vertices = arm.surface_mesh(pose, spacing=0.01).vertices
     cloud = vertices[farthest_points(vertices, 300)]
-    skin = sample_skin(arm, 200)
-    initial = Tracker(arm, pose, model_points=skin).state
+    skin = tr.sample_skin(arm, 200)
+    initial = tr.Tracker(arm, pose, model_points=skin).state
 
     def fitter(**options):
-        return FrameFitter(arm, TrackConfig(**options), skin)
+        return FrameFitter(arm, tr.TrackConfig(**options), skin)
 
     def state(**changes):
         means = {"num_data": 300.0, "num_inliers": 300.0, "ratio_in_reach": 1.0, "residual": 0.001}
@@ -77,7 +75,7 @@ def tracker(plain_hand, plain_hand_skin, truths):
     """Return a function that makes a tracker of the hand."""
 
     def make(initial_pose=truths[0], state=None, **config):
-        made = Tracker(plain_hand, initial_pose, config=TrackConfig(**config), model_points=plain_hand_skin)
+        made = tr.Tracker(plain_hand, initial_pose, config=tr.TrackConfig(**config), model_points=plain_hand_skin)
         made.state = state or made.state
         return made
 
@@ -130,7 +128,7 @@ def find(monkeypatch):
         def found(shape, data, *, config, **keypoints):
             calls.append((len(data), config))
             chosen = poses(len(calls)) if callable(poses) else poses
-            return PoseStarts(chosen, torch.tensor(costs), torch.tensor(0.9, dtype=chosen.dtype))
+            return tr.PoseStarts(chosen, torch.tensor(costs), torch.tensor(0.9, dtype=chosen.dtype))
 
         monkeypatch.setattr(recovery, "find_pose", found)
         return calls

@@ -6,10 +6,9 @@ from itertools import pairwise
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.datasets.hand import hand_motion
-from torchreg.errors import UnitsWarning
-from torchreg.result import Status
-from torchreg.tracking.recovery import Recovery, after_pause, flipped_poses
+from torchreg.tracking import recovery
 
 
 def test_bad_frames_are_named_and_do_not_stop_the_tracker(plain_hand, tip_errors, noise_frame, tracker, clouds, frames):
@@ -17,17 +16,17 @@ def test_bad_frames_are_named_and_do_not_stop_the_tracker(plain_hand, tip_errors
     made.run(frames[:3])
     before = made.state.pose
     noise = made.step(noise_frame())
-    assert (noise.status, noise.acquired) == (Status.LOST, "lost")
+    assert (noise.status, noise.acquired) == (tr.Status.LOST, "lost")
     assert not noise.status.usable
     empty = made.step(torch.zeros(0, 3))
-    assert (empty.status, empty.acquired) == (Status.NO_DATA, "held")
+    assert (empty.status, empty.acquired) == (tr.Status.NO_DATA, "held")
     assert empty.inlier_ratio == 0
     assert empty.std.isnan().all()
     assert (plain_hand.keypoints(empty.pose) - plain_hand.keypoints(before)).norm(dim=-1).max() < 0.02
-    assert made.step(torch.full((600, 3), torch.nan)).status is Status.NO_DATA
-    with pytest.warns(UnitsWarning, match="in millimeters"):
+    assert made.step(torch.full((600, 3), torch.nan)).status is tr.Status.NO_DATA
+    with pytest.warns(tr.errors.UnitsWarning, match="in millimeters"):
         scaled = made.step(1000 * frames[3])
-    assert (scaled.status, scaled.acquired) == (Status.OTHER_UNITS, "held")
+    assert (scaled.status, scaled.acquired) == (tr.Status.OTHER_UNITS, "held")
     assert made.state.lost == 4
     good = made.step(torch.cat([frames[3], torch.full((5, 3), torch.nan)]))
     assert good.status.usable
@@ -70,7 +69,7 @@ def test_a_wrong_pose_that_was_found_is_corrected_in_the_next_frame(
     plain_hand, plain_hand_skin, tracker, frames, find, truths
 ):
     """The first search, repeated three times, takes the hand for a flipped one; that in the next frame does not."""
-    flipped = flipped_poses(plain_hand_skin, truths[0])[:1]
+    flipped = recovery.flipped_poses(plain_hand_skin, truths[0])[:1]
     find(lambda number: flipped if number <= 4 else truths[1:2], [10.0])
     made = tracker(None)
     for frame, truth, correct in zip(frames, truths[:2], (False, True), strict=False):
@@ -85,14 +84,14 @@ def test_what_is_nowhere_stays_unknown_and_is_searched_ever_more_rarely(noise_fr
     searched = []
     find(lambda number: searched.append(made.state.frame) or truths[:1] + 2.0, [300.0])
     result = made.run([noise_frame(seed=k) for k in range(30)])
-    assert set(result.statuses) == {Status.LOST}
+    assert set(result.statuses) == {tr.Status.LOST}
     assert result.poses.isnan().all()
     assert result.keypoints.isnan().all()
     assert not made.state.found
     # After the second failure in a row, each cool-down is twice as long.
     assert [later - earlier for earlier, later in pairwise(sorted(set(searched)))] == [1, 3, 5, 9]
     before = len(searched)
-    assert tracker(None, recovery="none").step(noise_frame()).status is Status.LOST
+    assert tracker(None, recovery="none").step(noise_frame()).status is tr.Status.LOST
     assert len(searched) == before
 
 
@@ -128,7 +127,7 @@ def test_what_was_doubtful_in_all_frames_is_forgotten_when_it_is_gone(plain_hand
     lying[:3] += torch.tensor([0.0, 0.0, away]) - plain_hand.keypoints(truths[0]).mean(0)
     find(lambda number: truths[2:3] if made.state.frame == 2 else lying[None], [10.0])
     records = [made.step(points) for points in (wall(0, away), wall(1, away), frames[2], frames[3])]
-    assert [record.status for record in records[:2]] == [Status.DOUBTFUL, Status.DOUBTFUL]
+    assert [record.status for record in records[:2]] == [tr.Status.DOUBTFUL, tr.Status.DOUBTFUL]
     assert [record.acquired for record in records[2:]] == ["found", "tracked"]
     assert (plain_hand.keypoints(records[2].pose) - plain_hand.keypoints(truths[2])).norm(dim=-1).mean() < 0.005
 
@@ -138,7 +137,7 @@ def test_a_lost_hand_is_found_where_it_is_nearest(plain_hand, noise_frame, truth
     calls = find(torch.stack([moved(truths[5], 0.3), truths[5], truths[5]]), [10.0, 11.0, 300.0])
     made = tracker(state=replace(tracked.states[4], pose=moved(tracked.states[4].pose, -0.4)))
     records = [made.step(noise_frame(seed=k)) for k in range(3)]
-    assert {record.status for record in records} == {Status.LOST}
+    assert {record.status for record in records} == {tr.Status.LOST}
     assert calls == []
     records = [made.step(frames[5]) for _ in range(9)]
     first = next(record for record in records if record.status.usable)
@@ -165,19 +164,19 @@ def attempt(tracking, state, level="full", cloud=None):
     fitter, frame = tracking.fitter(recovery=level), tracking.frame(tracking.cloud if cloud is None else cloud)
     view = fitter.look(state, frame, fitter.predict(state, frame.elapsed))
     fit = None if view is None else fitter.descend(view, state, frame.elapsed)
-    return *Recovery(fitter)(state, frame, view, fit), fit
+    return *recovery.Recovery(fitter)(state, frame, view, fit), fit
 
 
 def test_a_flipped_base_is_among_the_starts(plain_hand, plain_hand_skin):
     truth = hand_motion(plain_hand, "bending_palm", 1, seed=1)[0]
-    flipped = flipped_poses(plain_hand_skin, truth)
+    flipped = recovery.flipped_poses(plain_hand_skin, truth)
     points = plain_hand_skin(truth)
     for pose in flipped:
         turned = plain_hand_skin(pose)
         torch.testing.assert_close(turned.mean(0), points.mean(0), atol=1e-5, rtol=0)
         assert (turned - points).norm(dim=-1).max() > 0.02
     # Half turns: done twice, nothing happened.
-    again = torch.stack([plain_hand_skin(pose) for pose in flipped_poses(plain_hand_skin, flipped[2])])
+    again = torch.stack([plain_hand_skin(pose) for pose in recovery.flipped_poses(plain_hand_skin, flipped[2])])
     assert (again - points).norm(dim=-1).amax(-1).min() < 1e-4
 
 
@@ -198,7 +197,7 @@ def test_nothing_is_tried_where_it_may_not_or_was_tried_lately(tracking, find):
         state = tracking.state(pose=tracking.bent(-0.3), **changes)
         fit, after, descended = attempt(tracking, state, level)
         assert fit is descended
-        assert after == after_pause(state)
+        assert after == recovery.after_pause(state)
     assert calls == []
 
 
@@ -220,7 +219,7 @@ def test_what_lies_beside_its_data_is_searched_again_until_a_pose_explains_them(
     calls = find(lambda number: moved(tracking.pose, 0.5 if number == 1 else 0.0)[None], [10.0])
     state = tracking.state(num_inliers=0.0, ratio_in_reach=0.0, residual=0.0)
     frame = tracking.frame(torch.cat([tracking.cloud] * 11))
-    fit = Recovery(tracking.fitter()).everywhere(state, frame)
+    fit = recovery.Recovery(tracking.fitter()).everywhere(state, frame)
     torch.testing.assert_close(fit.world_pose, tracking.pose, atol=5e-3, rtol=0)
     (num_data, first), (_, second) = calls
     assert (first.seed, second.seed) == (0, 1)
@@ -232,7 +231,7 @@ def test_what_lies_beside_its_data_is_searched_again_until_a_pose_explains_them(
 def test_searches_everywhere_end_without_a_pose(tracking, find):
     calls = find(moved(tracking.pose, 0.5)[None], [10.0])
     state = tracking.state(num_inliers=0.0, ratio_in_reach=0.0)
-    assert Recovery(tracking.fitter()).everywhere(state, tracking.frame()) is None
+    assert recovery.Recovery(tracking.fitter()).everywhere(state, tracking.frame()) is None
     assert [config.seed for _, config in calls] == [0, 1, 2, 3]
 
 
@@ -253,7 +252,7 @@ def test_noise_is_no_shape_and_a_hidden_one_is_not_searched(tracking, find):
 
 def test_no_attempt_moves_the_base_farther_than_it_gets(tracking):
     state, frame, fitter = tracking.state(), tracking.frame(), tracking.fitter()
-    recover = Recovery(fitter)
+    recover = recovery.Recovery(fitter)
     fit = fitter.fit_at(state, frame, tracking.pose, "surface")
     for dof, step, too_far in (
         (0, 0.3 * fitter.size, False),

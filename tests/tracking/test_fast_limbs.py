@@ -3,16 +3,19 @@
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.alignment.problem import centered_problem
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.geometry.rigid import rigid_matrix
-from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import sample_skin
-from torchreg.tracking.limb_combination import combine_limbs, fit_limbs, scatter_joints
+from torchreg.tracking import limb_combination
 
-EYE = torch.eye(3, dtype=torch.float64)
+
+def shifted(x, y):
+    """Return the transform (4, 4) of a shift in the plane."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:2, 3] = torch.tensor([x, y])
+    return matrix
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +24,11 @@ def crab():
     joints = [Joint("body", -1, torch.eye(4, dtype=torch.float64))]
     solids = [Primitive("ellipsoid", (0.1, 0.06, 0.05), torch.eye(4, dtype=torch.float64))]
     for name, side in (("left", -1.0), ("right", 1.0)):
-        position = rigid_matrix(EYE, torch.tensor([side * 0.07, 0.05, 0.0], dtype=torch.float64))
+        position = shifted(side * 0.07, 0.05)
         joints.append(Joint(name, 0, position, "revolute", (0.0, 0.0, 1.0), -1.2, 1.2))
-        along = rigid_matrix(EYE, torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64))
+        along = shifted(0.0, 0.1)
         solids.append(Primitive("ellipsoid", (0.02, 0.1, 0.02), along))
-    shape = ArticulatedShape(
+    shape = tr.ArticulatedShape(
         KinematicTree(tuple(joints)), ["body", "left", "right"], solids, nu=0.005, dtype=torch.float64
     )
     return shape.requires_grad_(False)
@@ -34,7 +37,7 @@ def crab():
 @pytest.fixture(scope="module")
 def problem(crab):
     """The alignment of 300 points of the crab, with its arms at 0.5 and -0.3 rad, predicted at rest."""
-    skin = sample_skin(crab, 300)
+    skin = tr.sample_skin(crab, 300)
     truth = crab.rest_pose()
     truth[6:] = torch.tensor([0.5, -0.3])
     data = skin(truth)[None]
@@ -53,17 +56,17 @@ def arms(pose, left, right):
 def test_every_limb_is_taken_from_the_pose_that_suits_it(crab, problem):
     built, truth = problem
     poses = torch.stack([arms(truth, 0.5, 0.8), arms(truth, -0.9, -0.3), arms(truth, 0.0, 0.0)])
-    found = combine_limbs(built, poses, 2, find_limbs(crab)[0])
+    found = limb_combination.combine_limbs(built, poses, 2, find_limbs(crab)[0])
     torch.testing.assert_close(found[0], truth)
-    torch.testing.assert_close(combine_limbs(built, poses[[2, 0, 1]], 0, find_limbs(crab)[0]), found)
-    assert torch.equal(combine_limbs(built, poses, 1, []), poses[1:2])
+    torch.testing.assert_close(limb_combination.combine_limbs(built, poses[[2, 0, 1]], 0, find_limbs(crab)[0]), found)
+    assert torch.equal(limb_combination.combine_limbs(built, poses, 1, []), poses[1:2])
 
 
 def test_the_base_is_that_of_the_best(crab, problem):
     built, truth = problem
     off = truth.clone()
     off[:3] += 0.01
-    found = combine_limbs(built, torch.stack([off, truth]), 1, find_limbs(crab)[0])
+    found = limb_combination.combine_limbs(built, torch.stack([off, truth]), 1, find_limbs(crab)[0])
     assert torch.equal(found[0], truth)
 
 
@@ -71,16 +74,16 @@ def test_starts_lead_to_the_pose_though_none_is_near_in_all_limbs(crab, problem)
     built, truth = problem
     starts = torch.stack([arms(truth, 0.4, 1.1), arms(truth, -1.0, -0.4), arms(truth, -0.6, 0.6)])
     starts[:, 0] += 0.004
-    found = fit_limbs(built, starts, find_limbs(crab)[0], torch.Generator().manual_seed(0))
+    found = limb_combination.fit_limbs(built, starts, find_limbs(crab)[0], torch.Generator().manual_seed(0))
     assert found.shape == (1, 8)
     torch.testing.assert_close(found[0, 6:], truth[6:], atol=0.05, rtol=0)
-    again = fit_limbs(built, starts, find_limbs(crab)[0], torch.Generator().manual_seed(0))
+    again = limb_combination.fit_limbs(built, starts, find_limbs(crab)[0], torch.Generator().manual_seed(0))
     assert torch.equal(again, found)
 
 
 def test_joints_are_scattered_and_the_base_is_not():
     pose = torch.arange(8.0)[None]
-    poses = scatter_joints(pose, torch.tensor([0.1, 0.4]), 4000, torch.Generator().manual_seed(0))
+    poses = limb_combination.scatter_joints(pose, torch.tensor([0.1, 0.4]), 4000, torch.Generator().manual_seed(0))
     assert torch.equal(poses[:, :6], pose[:, :6].expand(4000, -1))
     torch.testing.assert_close(poses[:, 6:].mean(0), pose[0, 6:], atol=0.02, rtol=0)
     torch.testing.assert_close(poses[:, 6:].std(0), torch.tensor([0.1, 0.4]), atol=0.01, rtol=0)

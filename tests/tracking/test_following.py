@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.errors import InputError
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.tracking.motion_model import predict_pose
+from torchreg.tracking import motion_model
 
 HINGE = 6
 
@@ -75,7 +74,7 @@ def test_other_model_points_follow_too(tip_errors, tracker, clouds, frames, mode
 def test_velocity_predicts_what_goes_on_evenly(plain_hand, truths, tracker, frames, tracked):
     for state, truth in zip(tracked.states[3:6], truths[4:7], strict=True):
         true = plain_hand.keypoints(truth)
-        poses = predict_pose(plain_hand, state, 1.0), state.pose
+        poses = motion_model.predict_pose(plain_hand, state, 1.0), state.pose
         near, far = ((plain_hand.keypoints(pose) - true).norm(dim=-1).mean() for pose in poses)
         assert near < 0.7 * far
     assert tracker(prediction="none").run(frames[:2]).statuses[1].usable
@@ -122,12 +121,3 @@ def test_keypoints_tell_where_a_hidden_finger_is(plain_hand, plain_hand_skin, tr
     off = [(track.keypoints[:, 8] - seen[8]).norm(dim=-1) for track in (alone, told)]
     assert float(off[0][0] - off[1][0]) == 0
     assert float(off[1][-1]) < 0.006 < 0.015 < float(off[0][-1])
-
-
-def test_bad_keypoints_are_told(plain_hand, tracker, frames):
-    with pytest.raises(InputError, match=r"keypoints must have shape \(21, 3\)"):
-        tracker().step(frames[0], keypoints=torch.zeros(5, 3))
-    with pytest.raises(InputError, match="keypoints in pixels need the camera"):
-        tracker().step(frames[0], keypoints=torch.zeros(21, 2))
-    with pytest.raises(InputError, match="keypoints must hold one entry per frame"):
-        tracker().run(frames[:2], keypoints=plain_hand.keypoints(plain_hand.rest_pose())[None])

@@ -1,14 +1,11 @@
 """The model points of the next frame: those that the data showed, the data themselves, or all."""
 
-import math
 from dataclasses import replace
 
 import torch
 
-from torchreg.shapes.articulated import ArticulatedShape
+import torchreg as tr
 from torchreg.tracking import model_points
-from torchreg.tracking.model_points import next_model_points
-from torchreg.tracking.tracker import TrackConfig, Tracker
 
 
 def one_side(tracking):
@@ -19,7 +16,7 @@ def one_side(tracking):
 def after(tracking, cloud, state=None, **options):
     fitter, state = tracking.fitter(**options), state or tracking.state(num_inliers=float(len(cloud)))
     fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
-    return fit, next_model_points(fitter, state, fit)
+    return fit, model_points.next_model_points(fitter, state, fit)
 
 
 def test_seen_points_are_those_near_data(tracking):
@@ -93,27 +90,6 @@ def test_parts_without_data_take_the_points_of_the_shape(arm, tracking):
     assert len(points[~hinged]) == body.sum()
 
 
-def test_points_of_a_hand_from_data_lie_on_it_and_are_spread_over_the_parts(
-    plain_hand, plain_hand_skin, tracker, frames
-):
-    made = tracker(model_points="data", num_model_points=120)
-    made.run(frames[:2])
-    state = made.state
-    parts = state.weights.argmax(-1)
-    counts = torch.bincount(parts, minlength=16)
-    sampled = torch.bincount(plain_hand_skin.weights.argmax(-1), minlength=16)
-    world = state.points + (state.pose - state.reference_pose)[:3]
-    from_data = torch.cdist(world, frames[1]).amin(-1) < 1e-5
-    for part in range(16):
-        if from_data[parts == part].any():
-            assert 4 <= counts[part] <= math.ceil(2 * 120 / 4)
-        else:
-            assert counts[part] == sampled[part]
-    assert from_data.float().mean() > 0.5
-    assert (plain_hand.distance(world[from_data], state.pose).abs() < 0.0056).all()
-    torch.testing.assert_close(state.weights.sum(-1), torch.ones(len(state.points)))
-
-
 def test_each_frame_draws_anew(tracking):
     state = tracking.state()
     first, later = (
@@ -128,10 +104,10 @@ def test_data_on_a_rigged_surface_take_the_weights_of_its_nearest_points(arm):
     mesh = arm.surface_mesh(arm.rest_pose(), spacing=0.02)
     weights = torch.nn.functional.one_hot((mesh.vertices[:, 0] > 0.06).long(), 2).double()
     joints = torch.tensor([[0.0, 0, 0], [0.06, 0, 0]], dtype=torch.float64)
-    rig = ArticulatedShape.from_skinned_mesh(
+    rig = tr.ArticulatedShape.from_skinned_mesh(
         mesh.vertices, mesh.faces, weights, joints, [-1, 0], dtype=torch.float64
     ).requires_grad_(False)
-    tracker = Tracker(rig, rig.rest_pose(), config=TrackConfig(model_points="data", num_model_points=100))
+    tracker = tr.Tracker(rig, rig.rest_pose(), config=tr.TrackConfig(model_points="data", num_model_points=100))
     assert tracker.run([mesh.vertices]).statuses[0].usable
     state = tracker.state
     assert len(state.points) > 60
@@ -146,6 +122,6 @@ def test_as_many_data_as_a_pose_takes_are_enough(tracking, monkeypatch):
     fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
     on_surface = int((fit.distance[0].abs() < model_points.WIDTHS.surface * fitter.size).sum())
     monkeypatch.setattr(model_points, "MIN_DATA", on_surface)
-    assert len(next_model_points(fitter, state, fit)[0]) < len(fitter.skin)
+    assert len(model_points.next_model_points(fitter, state, fit)[0]) < len(fitter.skin)
     monkeypatch.setattr(model_points, "MIN_DATA", on_surface + 1)
-    assert torch.equal(next_model_points(fitter, state, fit)[0], fitter.skin.points)
+    assert torch.equal(model_points.next_model_points(fitter, state, fit)[0], fitter.skin.points)

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from torchreg.errors import InputError
-from torchreg.tracking.tracker import TrackConfig, Tracker
+import torchreg as tr
+from torchreg.tracking import demo
 
 
 @pytest.mark.parametrize(
@@ -28,26 +28,44 @@ from torchreg.tracking.tracker import TrackConfig, Tracker
     ],
 )
 def test_configurations_that_make_no_sense_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        TrackConfig(**options)
+    with pytest.raises(tr.errors.InputError, match=message):
+        tr.TrackConfig(**options)
+
+
+EMPTY = torch.zeros(0, 3)
+
+
+def another_state(of, to):
+    to.state = of.state
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "error", "words"),
     [
-        (lambda t: t().step(torch.zeros(5, 2)), r"points must have shape \(M, 3\), got \(5, 2\)"),
-        (lambda t: t(nan_policy="raise").step(torch.full((50, 3), torch.nan)), "points must be finite"),
-        (lambda t: t().step(torch.zeros(0, 3), math.nan), "time must be finite and later"),
-        (lambda t: t().step(torch.zeros(0, 3), math.inf), "time must be finite and later"),
-        (lambda t: t().run([]), "frames must hold at least one cloud"),
-        (lambda t: t().run([torch.zeros(0, 3)] * 2, times=[0.0]), "one entry per frame, got 1"),
-        (lambda t: t(torch.zeros(26)), "initial_pose"),
-        (lambda t: t(torch.full((27,), torch.nan)), "initial_pose must be finite"),
+        (lambda t, *_: t().step(torch.zeros(5, 2)), "InputError", r"points must have shape \(M, 3\), got \(5, 2\)"),
+        (lambda t, *_: t(nan_policy="raise").step(torch.full((50, 3), torch.nan)), "InputError", "must be finite"),
+        (lambda t, *_: t().step(EMPTY, math.nan), "InputError", "time must be finite and later"),
+        (lambda t, *_: t().step(EMPTY, math.inf), "InputError", "time must be finite and later"),
+        (lambda t, *_: t().run([]), "InputError", "frames must hold at least one cloud"),
+        (lambda t, *_: t().run([EMPTY] * 2, times=[0.0]), "InputError", "one entry per frame, got 1"),
+        (lambda t, *_: t(torch.zeros(26)), "InputError", "initial_pose"),
+        (lambda t, *_: t(torch.full((27,), torch.nan)), "InputError", "initial_pose must be finite"),
+        (lambda t, *_: t().step(EMPTY, keypoints=torch.zeros(5, 3)), "InputError", r"must have shape \(21, 3\)"),
+        (lambda t, *_: t().step(EMPTY, keypoints=torch.zeros(21, 2)), "InputError", "in pixels need the camera"),
+        (lambda t, *_: t().run([EMPTY] * 2, keypoints=torch.zeros(1, 21, 3)), "InputError", "one entry per frame"),
+        (lambda t, arm, _: tr.Tracker(arm, locked=["elbow"]), "InputError", "locked names 'elbow'"),
+        (lambda t, *_: t().run([EMPTY] * 2, priors=[None]), "InputError", "priors must hold one entry per frame"),
+        (lambda t, arm, _: another_state(t(), tr.Tracker(arm)), "InputError", "7 degrees of freedom and 2 parts"),
+        (lambda t, *_: setattr(t(), "state", None), "InputTypeError", "state must be a TrackState, got NoneType"),
+        (lambda t, _, p: tr.Tracker(p, fit_shape=True, locked=["base"]), "InputError", "fit_shape goes without"),
+        (lambda t, _, p: tr.Tracker(p, fit_shape="all"), "InputError", "must be True, False or 'bones', got 'all'"),
+        (lambda t, arm, _: tr.Tracker(arm, fit_shape=True), "InputError", "has no mesh"),
+        (lambda *_: demo.run_demo(0), "InputError", "num_frames must be at least 1, got 0"),
     ],
 )
-def test_what_cannot_be_used_is_refused(tracker, call, message):
-    with pytest.raises(InputError, match=message):
-        call(tracker)
+def test_what_cannot_be_used_is_refused(tracker, arm, person, call, error, words):
+    with pytest.raises(getattr(tr.errors, error), match=words):
+        call(tracker, arm, person)
 
 
 def test_time_must_go_on(tracker):
@@ -56,13 +74,13 @@ def test_time_must_go_on(tracker):
     made.step(torch.zeros(0, 3))
     assert made.state.time == 2.0
     for time in (2.0, 1.5):
-        with pytest.raises(InputError, match=f"later than the frame before at 2, got {time}"):
+        with pytest.raises(tr.errors.InputError, match=f"later than the frame before at 2, got {time}"):
             made.step(torch.zeros(0, 3), time)
 
 
 def test_skins_of_other_shapes_are_refused(arm, plain_hand_skin):
-    with pytest.raises(InputError, match="model_points is a skin of another shape"):
-        Tracker(arm, model_points=plain_hand_skin)
+    with pytest.raises(tr.errors.InputError, match="model_points is a skin of another shape"):
+        tr.Tracker(arm, model_points=plain_hand_skin)
 
 
 def test_an_interruption_keeps_what_was_done(tracker, frames):

@@ -22,8 +22,8 @@ from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 from torchreg.spines.curves import points_along
+from torchreg.spines.names.tip_matching import TipReference, rank_mappings
 from torchreg.spines.skeletonize import SkeletonizeConfig, skeletonize
-from torchreg.spines.tip_matching import TipReference, rank_mappings
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def spine(
         check_animation_path(movie)
 
     from torchreg.spines.extract_spine import SpineConfig
-    from torchreg.spines.surfaces import FrameSurfaces
+    from torchreg.spines.frames.frame_surfaces import FrameSurfaces
 
     config = SpineConfig.growing(num_samples=samples) if growing else SpineConfig(num_tips=tips, num_samples=samples)
     with claimed(glb), _kept(progress):

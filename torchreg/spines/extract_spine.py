@@ -17,13 +17,14 @@ from torchreg.geometry.far_origin import far_origin, to_world
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
-from torchreg.spines.frame_notes import frame_notes, told_statuses
-from torchreg.spines.frame_skeletons import FrameSkeleton, skeletonize_frames
-from torchreg.spines.growing_spine import growing_spine
+from torchreg.spines.frames.frame_skeletons import FrameSkeleton, skeletonize_frames
+from torchreg.spines.frames.frame_surfaces import FrameSurfaces
+from torchreg.spines.frames.frame_warnings import irregularities, statuses_and_warnings
+from torchreg.spines.frames.outlier_frames import check_sizes, frames_to_pass_over, with_frames_between
+from torchreg.spines.growth.growing_spine import growing_spine
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
-from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
-from torchreg.spines.name_chain import TipNames
-from torchreg.spines.observed_limbs import (
+from torchreg.spines.limbs.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
+from torchreg.spines.limbs.observed_limbs import (
     FrameLimbs,
     accept_shared_paths,
     curve_topology,
@@ -32,15 +33,14 @@ from torchreg.spines.observed_limbs import (
     reject_odd_lengths,
     smooth_rough_limbs,
 )
+from torchreg.spines.names.name_chain import TipNames
+from torchreg.spines.names.tip_tracking import has_loops, track_tips
 from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
-from torchreg.spines.passed_over import check_sizes, frames_to_pass_over, with_frames_between
 from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
+from torchreg.spines.skeleton.tip_relations import TipRelations
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
-from torchreg.spines.surfaces import FrameSurfaces
-from torchreg.spines.tip_relations import TipRelations
-from torchreg.spines.tip_tracking import has_loops, track_tips
 
 
 @dataclass(frozen=True)
@@ -225,9 +225,9 @@ def _joined_spine(
         topologies=tuple(topologies),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
         up=guess_up(surfaces.samples),
-        **told_statuses(
+        **statuses_and_warnings(
             [
-                frame_notes(*rows)
+                irregularities(*rows)
                 for rows in zip(skeletons, surfaces.notes, shown.sum(1).tolist(), ~shown, ~own, strict=True)
             ]
         ),

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.labeled_tree import LimbGraph, path_lengths, skeleton_splits
-from torchreg.spines.observed_limbs import FrameLimbs, observe_limbs
+from torchreg.spines.limbs.observed_limbs import FrameLimbs, observe_limbs
+from torchreg.spines.names.tip_tracking import most_frequent_count
 from torchreg.spines.results import SpineSequence
-from torchreg.spines.tip_tracking import most_frequent_count
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +57,10 @@ class PriorSkeleton:
         Sizes are compared by the mean path from tip to tip, which neither bending nor a lost limb changes much.
         """
         counts = [len(skeleton.tips) for skeleton in skeletons]
-        usual = most_frequent_count(counts)
-        if num_tips is None and self.num_tips < usual:
+        common = most_frequent_count(counts)
+        if num_tips is None and self.num_tips < common:
             raise InputError(
-                f"prior must have the limbs of the data: it has {self.num_tips} tips, most frames show {usual}; "
+                f"prior must have the limbs of the data: it has {self.num_tips} tips, most frames show {common}; "
                 f"give one with all of them, or num_tips={self.num_tips} to leave the others out"
             )
         least = min(abs(count - self.num_tips) for count in counts)

@@ -17,19 +17,19 @@ from torchreg.geometry.skeleton import Skeleton, build_skeleton
 from torchreg.geometry.spread import SPREADS, spread_dimensions
 from torchreg.geometry.support import SUPPORTS, warn_about_support
 from torchreg.geometry.surface_graph import PIECES, coarsened, one_piece
-from torchreg.spines.centering import centered_curves
 from torchreg.spines.curves import align_frames, tangents
 from torchreg.spines.labeled_tree import Tips
-from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
-from torchreg.spines.limb_curves import JunctionBall, Rings, best_rings, largest_cost, limb_curve
-from torchreg.spines.limb_placement import Interior
-from torchreg.spines.loops import OpenedLoops, open_loops
 from torchreg.spines.paper.metanodes import metanode_junctions
 from torchreg.spines.paper.vertex_level_sets import vertex_level_sets
-from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
-from torchreg.spines.surfaces import as_surface, split_surface
-from torchreg.spines.tip_relations import TipRelations, surface_relations
-from torchreg.spines.tip_trees import TipTree, consensus_junctions, estimate_junction, grow_tip_tree
+from torchreg.spines.skeleton.centering import centered_curves
+from torchreg.spines.skeleton.level_sets import LevelSets, MeshEdges, level_sets
+from torchreg.spines.skeleton.limb_curves import JunctionBall, Rings, best_rings, largest_cost, limb_curve
+from torchreg.spines.skeleton.limb_placement import Interior
+from torchreg.spines.skeleton.loops import OpenedLoops, open_loops
+from torchreg.spines.skeleton.protrusions import average_geodesic_distance, find_protrusions
+from torchreg.spines.skeleton.surface import as_surface, split_surface
+from torchreg.spines.skeleton.tip_relations import TipRelations, surface_relations
+from torchreg.spines.skeleton.tip_trees import TipTree, consensus_junctions, estimate_junction, grow_tip_tree
 
 FLAT = "the surface is flat"  # how the note on it begins
 
@@ -187,13 +187,9 @@ class _SurfaceTips:
     """The K tips of a body, two or more.
 
     Args:
-        positions: (K, 3).
         vertices: (K,) of the surface.
-        confidence: (K,).
         distances: (K, V) geodesic distances from them.
-        relations: of the tips along the surface.
         spacing: between levels of these distances, and so between nodes.
-        notes: for the skeleton.
     """
 
     positions: Tensor

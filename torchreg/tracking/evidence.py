@@ -41,8 +41,8 @@ def deviates_far(fit: FrameFit, state: TrackState) -> bool:
     return fit.deviation > _LIMITS.deviation * fit.view.problem.size * max(1, state.lost)
 
 
-def lies_beside_data(fit: FrameFit, state: TrackState) -> bool:
-    """Return whether the data lie beside the surface rather than on it, as those of another object do."""
+def residual_too_large(fit: FrameFit, state: TrackState) -> bool:
+    """Return whether the data lie near the surface rather than on it, as those of another object do."""
     share = _LIMITS.doubtful_residual if state.lost else _LIMITS.max_residual
     return float(fit.residual) > max(share * state.residual, _LIMITS.fine_residual * fit.view.problem.size)
 
@@ -56,7 +56,7 @@ _LOSS: tuple[Criterion, ...] = (
     # Where hardly any data in reach lie on the surface, they are those of another object.
     lambda fit, state: fit.ratio_in_reach < _LIMITS.min_inliers * state.ratio_in_reach,
     # Before the first fit, there is no residual to compare with.
-    lambda fit, state: state.tracked and lies_beside_data(fit, state),
+    lambda fit, state: state.tracked and residual_too_large(fit, state),
 )
 # A fit is doubtful if one of these holds.
 _DOUBT: tuple[Criterion, ...] = (

@@ -1,4 +1,4 @@
-"""A frame as it comes, as seen from a pose, and with a pose fitted to it."""
+"""A frame as it comes, around a pose, and with a pose fitted to it."""
 
 from __future__ import annotations
 
@@ -46,8 +46,6 @@ class Frame:
         finite: (M,) True where a point is finite.
         elapsed: time since the frame before, in intervals.
         picture: whose points the cloud holds, if it is that of a depth camera.
-        known: what is held or told of the pose, or None.
-        keypoints: that a detector saw, or None.
     """
 
     cloud: Tensor
@@ -58,7 +56,7 @@ class Frame:
     keypoints: MeasuredKeypoints | None = None
 
     @property
-    def told(self) -> dict[str, Any]:
+    def prior_arguments(self) -> dict[str, Any]:
         """What is known as `align` and `find_pose` take it."""
         return {} if self.known is None else {"locked": self.known.locked, "prior": (self.known.mean, self.known.std)}
 
@@ -69,20 +67,20 @@ class Frame:
 
     @property
     def seen_keypoints(self) -> dict[str, Any]:
-        """The keypoints as `align` and `find_pose` take them beside what the camera saw; nothing without any."""
+        """The keypoints as `align` and `find_pose` take them next to what the camera measured; nothing without any."""
         if self.keypoints is None:
             return {}
         return {"keypoints": self.keypoints.targets, "keypoint_std": self.keypoints.std}
 
     @property
     def keypoints_in_space(self) -> dict[str, Any]:
-        """The same beside a cloud, which has no camera."""
+        """The same next to a cloud, which has no camera."""
         return {} if self.keypoints is None or self.keypoints.camera is not None else self.seen_keypoints
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame seen from a pose: the alignment of the data in reach, in coordinates around the pose's base.
+    """A frame around a pose: the alignment of the data in reach, in coordinates around the pose's base.
 
     Args:
         problem: one alignment; its prior's mean is the pose.

@@ -51,13 +51,7 @@ _SETTINGS = FrameSettings()
 
 
 class FrameFitter:
-    """Fits a shape to frames, from predictions or from given poses.
-
-    Args:
-        shape: the articulated shape, in metres.
-        config: see `TrackConfig`.
-        skin: the model points; sampled by default.
-    """
+    """Fits a shape to frames, from predictions or from given poses; model points are sampled by default."""
 
     def __init__(self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None) -> None:
         self.shape, self.config = shape, config
@@ -108,9 +102,9 @@ class FrameFitter:
             landmarks=None if frame.keypoints is None else frame.keypoints.of_problems(self._keypoints, origin[None]),
         )  # fmt: skip
         if frame.known is not None:
-            told = frame.known.near(origin).with_prior(problem, local[None])
-            prior = replace(told.prior, precision=told.prior.precision[0])
-            problem = replace(told, lower=told.lower[0], upper=told.upper[0], prior=prior)
+            informed = frame.known.near(origin).with_prior(problem, local[None])
+            prior = replace(informed.prior, precision=informed.prior.precision[0])
+            problem = replace(informed, lower=informed.lower[0], upper=informed.upper[0], prior=prior)
         return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
 
     @cached_property

@@ -39,16 +39,7 @@ def scatter_joints(pose: Tensor, std: Tensor, count: int, generator: torch.Gener
 
 
 def fit_limbs(problem: AlignProblem, starts: Tensor, limbs: Sequence[Limb], generator: torch.Generator) -> Tensor:
-    """Return the pose (1, num_dofs) that explains most data, each limb as fitted from the start that suits it best.
-
-    Args:
-        problem: one alignment.
-        starts: (S, num_dofs) in its coordinates, within the limits.
-        limbs: of the shape.
-        generator: draws the data that the starts are fitted to.
-
-    Cost: 15 ms for a hand and ten starts on one CPU core.
-    """
+    """Return the pose (1, num_dofs) that explains most data, each limb fitted from the best of starts (S, num_dofs)."""
     rows = torch.zeros(len(starts), dtype=torch.long, device=starts.device)
     batch = problem.draw(FAST_MOTION.num_data, generator).rows(rows)
     noise = torch.full_like(starts[:, 0], SEARCH_BUDGET.noise * problem.size)
@@ -63,13 +54,7 @@ def fit_limbs(problem: AlignProblem, starts: Tensor, limbs: Sequence[Limb], gene
 def combine_limbs(problem: AlignProblem, poses: Tensor, best: int, limbs: Sequence[Limb]) -> Tensor:
     """Return one of the poses (S, num_dofs), as (1, num_dofs), with each limb as in the pose that suits it best.
 
-    Limbs are chosen jointly, so that no two explain the same data.
-
-    Args:
-        problem: one alignment.
-        poses: in its coordinates.
-        best: index of the pose whose base is kept.
-        limbs: those with degrees of freedom.
+    Limbs are chosen jointly, so that no two explain the same data. The base is that of the pose with index ``best``.
     """
     if not limbs:
         return poses[best : best + 1]

@@ -37,12 +37,7 @@ FILTER = VelocityFilter()
 
 
 def advance_clock(state: TrackState, time: float | None) -> tuple[TrackState, float]:
-    """Return the state at the time of the next frame, and the time elapsed since the frame before, in intervals.
-
-    Args:
-        state: after the frame before.
-        time: of the frame, later than the one before; one interval later if None.
-    """
+    """Return the state at the next frame's time, one interval later if None, and the time elapsed, in intervals."""
     if state.frame == 0:
         return replace(state, frame=1, time=state.time if time is None else time), 1.0
     passed = (state.interval or 1.0) if time is None else time - state.time

@@ -18,7 +18,7 @@ from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.pose_algebra import difference, shifted
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.tracking.evidence import is_doubtful, is_supported, lies_beside_data
+from torchreg.tracking.evidence import is_doubtful, is_supported, residual_too_large
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.motion_model import uncertainty_growth
@@ -53,12 +53,7 @@ _PLAN = RecoveryPlan()
 
 
 class Recovery:
-    """Attempts to explain a frame better than descent from the prediction did.
-
-    Args:
-        fitter: of the frames.
-        source: of poses where the shape is lost; the default of the shape by default.
-    """
+    """Attempts to explain a frame better than descent from the prediction did; a source gives poses of a lost shape."""
 
     def __init__(self, fitter: FrameFitter, source: StartSource | None = None) -> None:
         self.fitter, self.level = fitter, fitter.config.recovery
@@ -67,14 +62,7 @@ class Recovery:
     def __call__(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
     ) -> tuple[FrameFit | None, TrackState]:
-        """Return the best fit of all attempts, None if the data do not support it, and the state after the attempts.
-
-        Args:
-            state: before the frame.
-            frame: the frame.
-            view: from the prediction, None without data in reach.
-            fit: by descent in the view.
-        """
+        """Return the best fit of all attempts, None if the data do not support it, and the state after the attempts."""
         if state.tracked:
             fit, state = self._around(state, frame, view, fit)
         else:
@@ -99,11 +87,11 @@ class Recovery:
     def everywhere(self, state: TrackState, frame: Frame, repetitions: int = _PLAN.max_repetitions) -> FrameFit | None:
         """Return the fit of a search everywhere; of equivalent poses after a loss, that of the one nearest to the last.
 
-        A fit whose data lie beside the surface is no pose of the shape: the first search is repeated with more effort.
+        Where the data do not lie on the surface of a fit, the first search is repeated with more effort.
         """
         best = self._find(state, frame, FindPoseConfig(seed=state.seed))
         for number in range(1, repetitions + 1):
-            if state.lost or (best is not None and not lies_beside_data(best, state)):
+            if state.lost or (best is not None and not residual_too_large(best, state)):
                 break
             config = FindPoseConfig(
                 seed=state.seed + number,
@@ -119,7 +107,8 @@ class Recovery:
         data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
         seen = data if frame.picture is None else frame.picture
         starts = find_pose(
-            shape, seen, initializer=self.source.proposer, config=config, **frame.told, **frame.seen_keypoints
+            shape, seen, initializer=self.source.proposer, config=config,
+            **frame.prior_arguments, **frame.seen_keypoints,
         )  # fmt: skip
         poses = starts.poses
         if state.lost:

@@ -103,7 +103,7 @@ class TrackState(Result):
     """All that the next frame of a tracker depends on. Means and largest values are running ones over half a second.
 
     Args:
-        frame: number of frames seen.
+        frame: number of frames so far.
         time: of the last one.
         interval: shortest time between two frames so far; zero before the second.
         pose: (num_dofs,) of the last frame, fitted or predicted; NaN before the shape was first found.
@@ -182,7 +182,7 @@ class TrackState(Result):
 
 @dataclass(frozen=True)
 class DemoResult(Result):
-    """A hand tracked through a made-up sequence, beside the truth; T frames were done.
+    """A hand tracked through a made-up sequence, and the truth; T frames were done.
 
     Args:
         track: what the tracker found.

@@ -331,7 +331,7 @@ class Tracker:
         return cloud
 
     def _known(self, prior: tuple[Any, Any] | None) -> KnownDofs | None:
-        """Return what is held and told of the pose, in the coordinates of the state; None if that is nothing."""
+        """Return the locked and prior degrees of freedom, in the coordinates of the state; None if that is nothing."""
         known = KnownDofs.of(self.shape, self._locked, prior)
         if known is None:
             return None
@@ -386,7 +386,7 @@ class Tracker:
         data = subsample(frame.data, self.config.max_points, frame_generator(state))
         config = AlignConfig(sharpness=self.config.sharpness)
         pose = align(
-            self.shape, data, state.pose, model_points=self._fitter.skin, config=config, **frame.told,
+            self.shape, data, state.pose, model_points=self._fitter.skin, config=config, **frame.prior_arguments,
             **frame.keypoints_in_space,
         ).pose  # fmt: skip
         return self._fitter.fit_at(state, frame, pose, "tracked")

@@ -35,13 +35,7 @@ _TEST = ClusterTest()
 
 
 class UnexplainedClusters:
-    """Finds clusters of data off the surface, and tells limbs that a fit may have missed from background.
-
-    Args:
-        skin: points of the shape.
-        limbs: of the shape.
-        size: of the shape, metres.
-    """
+    """Finds clusters of data off the surface, and separates limbs that a fit may have missed from background."""
 
     def __init__(self, skin: LinearBlendSkin, limbs: Sequence[Limb], size: float) -> None:
         self.size = size
@@ -83,14 +77,9 @@ def nearest_distance(points: Tensor, targets: Tensor) -> Tensor:
 
 
 class LimbReach:
-    """The space that the limbs of a shape can reach, as cells in the frame of its trunk, which is its first part.
+    """The space that limbs can reach, as cells in the frame of the trunk, the first part; all space without any limb.
 
     Data out of reach belong to no limb that was missed.
-
-    Args:
-        skin: points of the shape.
-        limbs: of the shape; without any, all space counts as reached.
-        cell: width of a cell, metres.
     """
 
     def __init__(self, skin: LinearBlendSkin, limbs: Sequence[Limb], cell: float) -> None:

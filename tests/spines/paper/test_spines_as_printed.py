@@ -9,15 +9,14 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.datasets.creatures import STARFISH, creature_sequence
-from torchreg.errors import InputError
+from tests.spines.bodies import STAR, star_skeleton
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.spines.labeled_tree import junctions_from_splits
-from torchreg.spines.level_sets import MeshEdges
 from torchreg.spines.paper.metanodes import metanode_junctions
 from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
 from torchreg.spines.paper.vertex_level_sets import vertex_level_sets
-from torchreg.spines.tip_trees import Branch, TipTree
+from torchreg.spines.skeleton.level_sets import MeshEdges
+from torchreg.spines.skeleton.tip_trees import Branch, TipTree
 
 
 @pytest.fixture(scope="module")
@@ -177,13 +176,6 @@ def test_two_different_pairs_of_three_way_junctions_are_one_of_four_limbs():
     assert len(metanode_junctions([as_tip_tree(red, root) for root in range(4)])) == 2
 
 
-def star(tips):
-    """A skeleton of straight limbs from the origin."""
-    nodes = torch.cat((torch.zeros(1, 3), tips))
-    edges = torch.stack((torch.zeros(len(tips), dtype=torch.int64), torch.arange(1, len(tips) + 1)), dim=1)
-    return tr.Skeleton(nodes, edges, torch.ones(len(nodes)))
-
-
 def kabsch_error(a, b):
     a, b = a - a.mean(0), b - b.mean(0)
     u, s, vt = np.linalg.svd(a.T @ b)
@@ -196,7 +188,7 @@ def test_tips_are_mapped_by_the_least_rigid_error():
     base = torch.randn(5, 3, generator=generator)
     order = [torch.randperm(5, generator=generator) for _ in range(6)]
     frames = [base[row] + 0.05 * torch.randn(5, 3, generator=generator) for row in order]
-    labels, reference = track_tips_rigidly([star(tips) for tips in frames])
+    labels, reference = track_tips_rigidly([star_skeleton(tips) for tips in frames])
     assert reference == 2
     known = frames[reference].double().numpy()
     for tips, row in zip(frames, labels, strict=True):
@@ -209,27 +201,18 @@ def test_tips_are_mapped_by_the_least_rigid_error():
 def test_a_superfluous_tip_gets_no_name_and_a_missing_one_is_told():
     base = torch.randn(4, 3, generator=torch.Generator().manual_seed(1))
     more = torch.cat((base, torch.tensor([[0.1, 0.1, 0.2]])))
-    labels, _ = track_tips_rigidly([star(tips) for tips in (base, base, more, base, base[:3])])
+    labels, _ = track_tips_rigidly([star_skeleton(tips) for tips in (base, base, more, base, base[:3])])
     assert labels[2].tolist() == [0, 1, 2, 3]
     assert labels[4].tolist() == [0, 1, 2, -1]
 
 
 def test_a_number_of_tips_that_no_frame_has_is_refused():
-    with pytest.raises(InputError, match="num_tips must be what a frame shows, 4 at most, got 7"):
-        track_tips_rigidly([star(torch.eye(4, 3))], 7)
+    with pytest.raises(tr.errors.InputError, match="num_tips must be what a frame shows, 4 at most, got 7"):
+        track_tips_rigidly([star_skeleton(torch.eye(4, 3))], 7)
 
 
-def test_a_prior_has_no_place_in_it():
-    made = creature_sequence(STARFISH, 1, resolution=32, seed=0)
-    with pytest.raises(InputError, match=r"prior cannot be used by SpineConfig.paper\(\)"):
-        tr.extract_spine(made.meshes, prior=star(torch.eye(3)), config=tr.SpineConfig.paper())
-
-
-def test_a_starfish_has_five_arms_that_keep_their_names():
-    made = creature_sequence(STARFISH, 4, resolution=48, seed=0)
-    spine = tr.extract_spine(made.meshes, config=tr.SpineConfig.paper(), workers=1)
-    assert spine.own_topologies == ("(()()()()())",) * 4
+def test_a_starfish_has_five_arms_that_keep_their_names(starfish):
+    spine = tr.extract_spine(starfish.meshes[:4], config=tr.SpineConfig.paper(), workers=1)
+    assert spine.own_topologies == (STAR,) * 4
     assert spine.found.all()
-    config = tr.SpineConfig.paper(num_samples=12)
-    assert (config.num_samples, config.printed, config.skeletons.printed) == (12, True, True)
-    assert not tr.SpineConfig().printed
+    assert tr.SpineConfig.paper(num_samples=12).num_samples == 12

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchreg.spines.labeled_tree import Tips, junctions_from_splits, without_tip_zero
-from torchreg.spines.tip_trees import TipTree
+from torchreg.spines.skeleton.tip_trees import TipTree
 
 
 def metanode_junctions(trees: Sequence[TipTree]) -> list[tuple[Tips, ...]]:

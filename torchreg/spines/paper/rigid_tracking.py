@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.geometry.skeleton import Skeleton
-from torchreg.spines.tip_matching import TipReference, rank_mappings
-from torchreg.spines.tip_tracking import longest_run, most_frequent_count
+from torchreg.spines.names.tip_matching import TipReference, rank_mappings
+from torchreg.spines.names.tip_tracking import longest_run, most_frequent_count
 
 # More than any rigid fit: a tip stays without a name only if there are too few.
 _NEVER_MISSING = 1e6

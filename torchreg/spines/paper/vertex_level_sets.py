@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.graphs import connected_components
-from torchreg.spines.level_sets import LevelSets, MeshEdges
+from torchreg.spines.skeleton.level_sets import LevelSets, MeshEdges
 
 # Share of the edges that are shorter than a bin is wide.
 _MOST_EDGES = 0.95

@@ -11,10 +11,10 @@ from torch import Tensor
 from torchreg.geometry.graphs import Graph
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import curve_lengths
+from torchreg.spines.growth.organ_graph import LimbChain, limbs_between, shown_graph
+from torchreg.spines.growth.organ_tracks import OrganTracks
 from torchreg.spines.labeled_tree import LimbGraph
-from torchreg.spines.observed_limbs import observe_limbs
-from torchreg.spines.organ_graph import LimbChain, limbs_between, shown_graph
-from torchreg.spines.organ_tracks import OrganTracks
+from torchreg.spines.limbs.observed_limbs import observe_limbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,7 @@ class GrowingLimbs:
 
     Args:
         curves: (T, L, S, 3), without length where the limb does not exist.
-        radii: (T, L, S).
         observed: (T, L) True where the frame's own skeleton has the limb.
-        present: (T, L) True where it exists.
     """
 
     curves: Tensor

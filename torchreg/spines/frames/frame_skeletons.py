@@ -13,10 +13,10 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
-from torchreg.spines.frame_workers import Job, KeptResults, do_jobs
+from torchreg.spines.frames.frame_workers import Job, KeptResults, do_jobs
 from torchreg.spines.results import SpineRecord
+from torchreg.spines.skeleton.tip_relations import TipRelations
 from torchreg.spines.skeletonize import SkeletonizeConfig, skeletonize_surface
-from torchreg.spines.tip_relations import TipRelations
 
 # The tensors of a skeleton, and those of its tips' relations.
 _FIELDS = ("nodes", "edges", "radii", "frames", "confidence")

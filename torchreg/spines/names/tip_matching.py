@@ -39,7 +39,6 @@ class TipReference:
     Args:
         tips: (K, 3), or curves (K, S, 3) of the limbs, from the tip inwards.
         lengths: (K, K) path lengths along the skeleton from tip to tip; None: not compared.
-        weight: of this reference among several.
         rotation_weight: of the rotation itself, which should be small between frames near in time.
     """
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchreg.spines.curves import arc_lengths, binomial_smoothing, curve_frames
 from torchreg.spines.labeled_tree import Tips
-from torchreg.spines.tip_trees import TipTree
+from torchreg.spines.skeleton.tip_trees import TipTree
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.skeleton import nearest_rotation
-from torchreg.spines.body_mirror import BodyMirror, find_mirror
-from torchreg.spines.student_t import SHRINKAGE, TAILS, GroupedDensity, fit_groups, t_log_density
-from torchreg.spines.tip_features import SAMPLING, TipFeatures, TipObservations
+from torchreg.spines.names.body_mirror import BodyMirror, find_mirror
+from torchreg.spines.names.student_t import SHRINKAGE, TAILS, GroupedDensity, fit_groups, t_log_density
+from torchreg.spines.names.tip_features import SAMPLING, TipFeatures, TipObservations
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class NameModel:
         background_mean: (n,) under random names.
         background: density of features under random names.
         correlation: (G,) of errors between two frames, of each group of features.
-        usual: (K (K - 1) / 2,) median distances between named tips.
+        median_distances: (K (K - 1) / 2,) median distances between named tips.
         displacement: (S,) scale of the displacements of a limb's points.
         turn: mean of 1 - cos of the body's rotation between two frames.
         log_volume: of the space that limbs move in.
@@ -71,7 +71,7 @@ class NameModel:
     background_mean: Tensor
     background: GroupedDensity
     correlation: Tensor
-    usual: Tensor
+    median_distances: Tensor
     displacement: Tensor
     turn: float
     log_volume: float
@@ -84,17 +84,17 @@ class NameModel:
         with_volumes = any(bool(frame.volumes.any()) for frame in frames)
         features = TipFeatures(len(names), frames[0].limbs.shape[1], with_volumes=with_volumes)
         center, background = _background(features, frames)
-        usual = features.distances(frames[reference], names[None])[0]
-        usual = torch.where(usual.isnan(), usual.nanmean().nan_to_num(), usual)
+        median = features.distances(frames[reference], names[None])[0]
+        median = torch.where(median.isnan(), median.nanmean().nan_to_num(), median)
         points = torch.cat([frame.curves.flatten(0, 1) for frame in frames])
         return cls(
             features=features,
-            mean=features(frames[reference], names[None], usual)[0],
+            mean=features(frames[reference], names[None], median)[0],
             density=GroupedDensity(features.groups, [SHRINKAGE.variance * c for c in background.covariances]),
             background_mean=center,
             background=background,
             correlation=torch.full((len(features.groups),), PRIORS.correlation, dtype=torch.float64),
-            usual=usual,
+            median_distances=median,
             displacement=torch.zeros(SAMPLING.num_points, dtype=torch.float64),
             turn=PRIORS.turn,
             log_volume=3 * math.log(float((points.amax(0) - points.amin(0)).norm().clamp_min(1e-6))),
@@ -120,7 +120,7 @@ class NameModel:
 
     def of_names(self, frame: TipObservations, maps: Tensor) -> Tensor:
         """Return the features (P, n) of a frame under mappings (P, K)."""
-        return self.features(frame, maps, self.usual)
+        return self.features(frame, maps, self.median_distances)
 
     def first_scores(self, features: Tensor) -> Tensor:
         """Return the log-probability ratios (P,) of features (P, n) of a frame by itself to the background."""
@@ -178,9 +178,9 @@ class NameModel:
         """Return the model that fits names (T, K) best."""
         maps = names.unsqueeze(1)
         distances = torch.cat([self.features.distances(*row) for row in zip(frames, maps, strict=True)])
-        usual = distances.nanmedian(0).values
-        usual = torch.where(usual.isnan(), self.usual, usual)
-        samples = torch.cat([self.features(frame, row, usual) for frame, row in zip(frames, maps, strict=True)])
+        median = distances.nanmedian(0).values
+        median = torch.where(median.isnan(), self.median_distances, median)
+        samples = torch.cat([self.features(frame, row, median) for frame, row in zip(frames, maps, strict=True)])
         mirrored = samples if self.mirror is None else torch.cat((samples, self.mirror(samples)))
         mean, density = fit_groups(mirrored, self.background)
         return replace(
@@ -188,7 +188,7 @@ class NameModel:
             mean=mean,
             density=density,
             correlation=_correlations(density.whitened(samples - mean)),
-            usual=usual,
+            median_distances=median,
             weight=1.0,
             **self._motion(frames, names),
         )

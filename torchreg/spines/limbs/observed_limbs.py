@@ -36,10 +36,8 @@ class FrameLimbs:
 
     Args:
         curves: (L, S, 3) in the order and direction of `LimbGraph.edges`.
-        radii: (L, S).
         observed: (L,) True where the frame's own skeleton has the limb; others are unknown or were transferred.
-        node_observed: (N,) True for nodes of the graph that the frame's own skeleton has.
-        nodes: (N, 3) positions of the nodes of the graph.
+        node_observed: (N,) the same of the nodes of the graph.
     """
 
     curves: Tensor

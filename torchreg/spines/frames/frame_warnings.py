@@ -11,7 +11,7 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
 
 
-def told_statuses(notes: Sequence[Sequence[str]]) -> dict[str, Any]:
+def statuses_and_warnings(notes: Sequence[Sequence[str]]) -> dict[str, Any]:
     """Return the statuses of the frames and of all, and the warnings, from the notes on each frame."""
     return {
         "statuses": tuple(Status.WITH_WARNINGS if rows else Status.CONVERGED for rows in notes),
@@ -20,7 +20,7 @@ def told_statuses(notes: Sequence[Sequence[str]]) -> dict[str, Any]:
     }
 
 
-def frame_notes(
+def irregularities(
     skeleton: Skeleton, notes: Sequence[str], num_named: int, missing: Tensor, transferred: Tensor
 ) -> list[str]:
     """Return the irregularities of a frame, with missing tips (K,) and transferred limbs (L,)."""

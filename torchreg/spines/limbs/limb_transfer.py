@@ -16,11 +16,11 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import align_frames, curve_frames, tangents
-from torchreg.spines.depth_field import DepthField, move_inside
-from torchreg.spines.frame_workers import Job, KeptResults, do_jobs
+from torchreg.spines.frames.frame_workers import Job, KeptResults, do_jobs
 from torchreg.spines.labeled_tree import LimbGraph, gather_nodes, number_nodes, path_lengths
-from torchreg.spines.local_icp import LOCAL_FITS, SurfacePoints, transfer_nodes
-from torchreg.spines.observed_limbs import FrameLimbs
+from torchreg.spines.limbs.depth_field import DepthField, move_inside
+from torchreg.spines.limbs.local_icp import LOCAL_FITS, SurfacePoints, transfer_nodes
+from torchreg.spines.limbs.observed_limbs import FrameLimbs
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import arc_lengths, points_along
 from torchreg.spines.labeled_tree import path_lengths
-from torchreg.spines.student_t import FeatureGroup
-from torchreg.spines.tip_relations import TipRelations
+from torchreg.spines.names.student_t import FeatureGroup
+from torchreg.spines.skeleton.tip_relations import TipRelations
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,6 @@ class TipObservations:
 
     Args:
         curves: (M, S, 3) points of the limbs, from the tips towards the middle of the body.
-        geodesics: (M, M) distances along the surface.
-        volumes: (M, M, M), see `TipRelations`.
         limbs: (M, F) of each limb: the length to the middle, logarithms of radii.
     """
 
@@ -116,14 +114,14 @@ class TipFeatures:
         values = frame.geodesics[first.clamp_min(0), second.clamp_min(0)]
         return torch.where((first >= 0) & (second >= 0), values, torch.nan)
 
-    def __call__(self, frame: TipObservations, maps: Tensor, usual: Tensor) -> Tensor:
+    def __call__(self, frame: TipObservations, maps: Tensor, median_distances: Tensor) -> Tensor:
         """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN for missing tips.
 
-        Distances to missing tips are replaced by the usual ones between named tips, (K (K - 1) / 2,).
+        Distances to missing tips are replaced by the medians between named tips, (K (K - 1) / 2,).
         """
         index, found = maps.clamp_min(0), maps >= 0
         distances = self.distances(frame, maps)
-        complete = torch.where(distances.isnan(), usual, distances)
+        complete = torch.where(distances.isnan(), median_distances, distances)
         tips = torch.where(found, complete @ self._tip_terms, torch.nan)
         sides = torch.where(distances.isnan(), torch.nan, complete @ self._left_over)
         a, b, c = (index[:, column] for column in self.triples.unbind(1))

@@ -11,17 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_points
+from torchreg._checks import check_choice
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.cloud_surface import cloud_surface, enough_places
 from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.poisson_body import poisson_body
-from torchreg.geometry.spread import SPREADS, spread_dimensions
-from torchreg.geometry.support import SUPPORTS, SupportSplit, split_support, warn_about_support
-from torchreg.spines.frame_workers import Job, KeptResults, do_jobs
-
-ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs follow the side that they show"
+from torchreg.geometry.support import SUPPORTS, SupportSplit, warn_about_support
+from torchreg.spines.frames.frame_workers import Job, KeptResults, do_jobs
+from torchreg.spines.skeleton.surface import as_surface, points_without_faces, split_surface
 
 
 @dataclass(frozen=True)
@@ -32,47 +28,6 @@ class _SurfaceSampling:
 
 
 _SAMPLING = _SurfaceSampling()
-
-
-def split_surface(value: Any, name: str, support: str) -> tuple[TriangleMesh | Tensor, SupportSplit | None]:
-    """Return a mesh, or points without faces, without its support, and that; None for no support."""
-    points = _cloud(value)
-    if points is None:
-        mesh = as_mesh(value, name)
-        split = split_support(mesh) if support == "auto" and mesh.num_faces else None
-        return (mesh, None) if split is None or split.plane is None else (split.rest(mesh), split)
-    points = as_float_tensor(points, name)
-    check_points(points, name, batch=False)
-    split = split_support(points) if support == "auto" else None
-    return (points, None) if split is None or split.plane is None else (points[~split.mask], split)
-
-
-def as_surface(value: Any, name: str) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Return the surface of a mesh, or of points without faces, and notes on it.
-
-    Points that show most of a body from both sides have that of `poisson_body`; others, as of leaves or of a single
-    view, that of `cloud_surface`.
-    """
-    points = _cloud(value)
-    if points is None:
-        return as_mesh(value, name), ()
-    points = as_float_tensor(points, name)
-    check_points(points, name, batch=False)
-    places = enough_places(points, name)
-    size = (places.amax(0) - places.amin(0)).norm()
-    body = poisson_body(places) if int(spread_dimensions(places, size)) == len(SPREADS) else None
-    if body is not None and body.is_whole:
-        notes = (f"{body.joined} piece(s) joined across gaps between points",) if body.joined else ()
-        return TriangleMesh(body.mesh.vertices.to(points), body.mesh.faces.to(points.device)), notes
-    found = cloud_surface(points.detach(), name)
-    return found.mesh, () if found.encloses else (ONE_SIDED,)
-
-
-def _cloud(value: Any) -> Tensor | None:
-    """Return the points of a value without faces; None if it has some."""
-    has_points = hasattr(value, "points") and not isinstance(value, TriangleMesh)
-    points = value.points if has_points and getattr(value, "faces", None) is None else value
-    return points if isinstance(points, Tensor) else None
 
 
 # A surface and the notes on it.
@@ -135,15 +90,12 @@ def _from_tensors(tensors: Mapping[str, Tensor], notes: Sequence[str]) -> _Surfa
 class FrameSurfaces(Sequence[TriangleMesh]):
     """The surfaces of frames.
 
-    Meshes are taken from their sequence when they are asked for, as from files, and are not kept; the surfaces of
-    clouds, which are expensive, are.
+    Meshes are read from their sequence on request and are not kept; the surfaces of clouds, which are expensive, are.
 
     Args:
         frames: meshes, or points without faces; any sequence.
         made: the surfaces of clouds by the number of the frame.
-        notes: on each frame.
         samples: some vertices of each frame, for its size and position.
-        shift: (3,) added to vertices; None for nothing.
         supports: what meshes stand on, which is cut off, by the number of the frame.
     """
 
@@ -165,10 +117,9 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         progress: str | os.PathLike[str] | None = None,
         support: str = "auto",
     ) -> FrameSurfaces:
-        """Return the surfaces of frames, each of which is taken when its turn comes.
+        """Return the surfaces of frames, read one by one; errors name the frame.
 
-        Errors name the frame. ``progress`` is a folder that keeps the surfaces of clouds for later calls; for
-        ``support`` see `split_support`.
+        ``progress`` is a folder that keeps the surfaces of clouds for later calls; for ``support`` see `split_support`.
         """
         check_choice(support, "support", SUPPORTS)
         if isinstance(frames, TriangleMesh):
@@ -177,7 +128,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         if not names:
             raise InputError("meshes must hold at least one frame, got none")
         making = _Making(frames, names, KeptResults.in_folder(progress), support)
-        first, jobs = _cloud(frames[0]), making.jobs()
+        first, jobs = points_without_faces(frames[0]), making.jobs()
         do_jobs(lambda: next(jobs, None), len(names), 1 if first is not None and first.is_cuda else workers)
         samples = tuple(making.samples[number] for number in range(len(names)))
         if making.supports:

@@ -13,14 +13,7 @@ from torchreg.geometry.graphs import Graph, minimum_spanning_forest
 
 @dataclass(frozen=True, eq=False)
 class Protrusions:
-    """Tips of protrusions, most salient first.
-
-    Args:
-        tips: (K,) nodes of the graph.
-        heights: (K,) persistence of each maximum, in the unit of the function; for the highest one its value less the
-            least.
-        confidence: (K,) from 0.5 for a tip of just the least height towards 1.
-    """
+    """Tips (K,) of protrusions, most salient first, with the persistence and a confidence of 0.5 to 1 of each."""
 
     tips: Tensor
     heights: Tensor

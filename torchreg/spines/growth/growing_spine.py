@@ -10,18 +10,18 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
-from torchreg.spines.frame_notes import frame_notes, told_statuses
-from torchreg.spines.frame_skeletons import FrameSkeleton
-from torchreg.spines.growing_limbs import GrowingLimbs, growing_limbs
+from torchreg.spines.frames.frame_skeletons import FrameSkeleton
+from torchreg.spines.frames.frame_surfaces import FrameSurfaces
+from torchreg.spines.frames.frame_warnings import irregularities, statuses_and_warnings
+from torchreg.spines.growth.growing_limbs import GrowingLimbs, growing_limbs
+from torchreg.spines.growth.organ_graph import common_graph, restricted, shown_tree
+from torchreg.spines.growth.organ_tracks import OrganTracks, track_organs
 from torchreg.spines.labeled_tree import LimbGraph
-from torchreg.spines.limb_transfer import transported_frames
-from torchreg.spines.observed_limbs import smooth_rough_limbs
-from torchreg.spines.organ_graph import common_graph, restricted, shown_tree
-from torchreg.spines.organ_tracks import OrganTracks, track_organs
+from torchreg.spines.limbs.limb_transfer import transported_frames
+from torchreg.spines.limbs.observed_limbs import smooth_rough_limbs
+from torchreg.spines.names.tip_features import observe_tips
 from torchreg.spines.results import SpineSequence
 from torchreg.spines.spine import Spine
-from torchreg.spines.surfaces import FrameSurfaces
-from torchreg.spines.tip_features import observe_tips
 
 _NO_TIP = -50.0  # log-odds that no place on tracks makes up for
 
@@ -61,7 +61,7 @@ def growing_spine(
         up=guess_up(surfaces.samples),
         births=tracks.births,
         ends=tracks.ends,
-        **told_statuses(_notes(skeletons, surfaces.notes, tracks, limbs)),
+        **statuses_and_warnings(_notes(skeletons, surfaces.notes, tracks, limbs)),
     )
 
 
@@ -71,12 +71,14 @@ def _certainty(confidence: Tensor) -> Tensor:
 
 
 def _notes(
-    skeletons: Sequence[Skeleton], told: Sequence[tuple[str, ...]], tracks: OrganTracks, limbs: GrowingLimbs
+    skeletons: Sequence[Skeleton], notes: Sequence[tuple[str, ...]], tracks: OrganTracks, limbs: GrowingLimbs
 ) -> list[list[str]]:
     """Return the irregularities of the frames; what is not there is not missed."""
     shown = tracks.labels >= 0
     missing, transferred = tracks.alive & ~shown, limbs.present & ~limbs.observed
-    return [frame_notes(*row) for row in zip(skeletons, told, shown.sum(1).tolist(), missing, transferred, strict=True)]
+    return [
+        irregularities(*row) for row in zip(skeletons, notes, shown.sum(1).tolist(), missing, transferred, strict=True)
+    ]
 
 
 def _topology(graph: LimbGraph, alive: Tensor) -> str:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.spines.student_t import GroupedDensity
-from torchreg.spines.tip_features import TipFeatures, TipObservations
+from torchreg.spines.names.student_t import GroupedDensity
+from torchreg.spines.names.tip_features import TipFeatures, TipObservations
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,9 @@ SEARCH = SymmetrySearch()
 
 @dataclass(frozen=True, eq=False)
 class BodyMirror:
-    """A mirror symmetry of a body, which exchanges some names.
+    """A mirror symmetry of a body: the mirror image of each name (K,), and of each feature (n,) with its sign.
 
-    Args:
-        names: (K,) the mirror image of each name.
-        columns: (n,) of features, those of the mirror image.
-        signs: (n,) -1 for signed volumes, which a mirror turns inside out.
-        levels: (G,) variance of each group of features from asymmetric poses, in those of random names.
+    ``levels`` (G,) are variances of groups of features from asymmetric poses, in those of random names.
     """
 
     names: Tensor

@@ -32,14 +32,15 @@ _LIMITS = SizeLimits()
 def check_sizes(samples: Sequence[Tensor], *, growing: bool) -> None:
     """Raise InputError if a frame differs far in size from most, or, growing, from the one before it."""
     sizes = torch.stack([_size(points) for points in samples])
-    usual = torch.cat((sizes[:1], sizes[:-1])) if growing else sizes.median().expand_as(sizes)
-    ratios = torch.where((sizes > 0) & (usual > 0), (sizes / usual).log().abs().exp(), 1.0)  # points: checked elsewhere
+    expected = torch.cat((sizes[:1], sizes[:-1])) if growing else sizes.median().expand_as(sizes)
+    # Points, whose size is zero, are checked elsewhere.
+    ratios = torch.where((sizes > 0) & (expected > 0), (sizes / expected).log().abs().exp(), 1.0)
     frame = int(ratios.argmax())
     if float(ratios[frame]) > _LIMITS.most:
         than = "the frame before it" if growing else "most frames"
         raise InputError(
             f"meshes must be in one unit: meshes[{frame}] is {float(ratios[frame]):.3g} times as "
-            f"{'large' if sizes[frame] > usual[frame] else 'small'} as {than}; scale it, or leave it out"
+            f"{'large' if sizes[frame] > expected[frame] else 'small'} as {than}; scale it, or leave it out"
         )
 
 
@@ -76,7 +77,7 @@ def with_frames_between(
     absent = spine.curves.isnan()[nearest]
     nothing = spine.found.new_zeros(())
     notes = [f"frame {number}: passed over: {'; '.join(row.notes)}" for number, row in passed.items()]
-    told = [*notes, *(_renumbered(warning, kept) for warning in spine.warnings)]
+    warnings = [*notes, *(_renumbered(warning, kept) for warning in spine.warnings)]
     statuses = [
         spine.statuses[int(row)] if flag else Status.WITH_WARNINGS for row, flag in zip(nearest, there, strict=True)
     ]
@@ -100,7 +101,7 @@ def with_frames_between(
         ),
         statuses=tuple(statuses),
         status=Status.WITH_WARNINGS,
-        warnings=tuple(sorted(told, key=lambda warning: int(warning.split(":")[0].removeprefix("frame ")))),
+        warnings=tuple(sorted(warnings, key=lambda warning: int(warning.split(":")[0].removeprefix("frame ")))),
         births=None if spine.births is None else numbers[spine.births],
         ends=None if spine.ends is None else numbers[spine.ends],
     )

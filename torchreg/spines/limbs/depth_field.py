@@ -86,12 +86,12 @@ class DepthField:
 
 def _beside_others(inside: Tensor) -> Tensor:
     """Return a mask (X, Y, Z) of the voxels with a neighbor along an axis on the other side of a surface."""
-    beside = torch.zeros_like(inside)
+    at_surface = torch.zeros_like(inside)
     for axis, size in enumerate(inside.shape):
         changes = inside.narrow(axis, 1, size - 1) != inside.narrow(axis, 0, size - 1)
-        beside.narrow(axis, 1, size - 1).logical_or_(changes)
-        beside.narrow(axis, 0, size - 1).logical_or_(changes)
-    return beside
+        at_surface.narrow(axis, 1, size - 1).logical_or_(changes)
+        at_surface.narrow(axis, 0, size - 1).logical_or_(changes)
+    return at_surface
 
 
 def move_inside(

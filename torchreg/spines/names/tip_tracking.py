@@ -12,10 +12,10 @@ from torch import Tensor
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import curve_lengths, points_along
 from torchreg.spines.labeled_tree import path_lengths
-from torchreg.spines.name_chain import TipNames, name_over_time
-from torchreg.spines.tip_features import observe_tips
-from torchreg.spines.tip_matching import TipReference, rank_mappings, tries_all_mappings
-from torchreg.spines.tip_relations import TipRelations
+from torchreg.spines.names.name_chain import TipNames, name_over_time
+from torchreg.spines.names.tip_features import observe_tips
+from torchreg.spines.names.tip_matching import TipReference, rank_mappings, tries_all_mappings
+from torchreg.spines.skeleton.tip_relations import TipRelations
 
 
 @dataclass(frozen=True)

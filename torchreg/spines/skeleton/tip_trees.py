@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchreg.geometry.graphs import Graph
 from torchreg.spines.labeled_tree import Tips, junctions_from_splits, without_tip_zero
-from torchreg.spines.level_sets import LevelSets
+from torchreg.spines.skeleton.level_sets import LevelSets
 
 # Triples of tips that say where a junction lies, at most; many tips make very many, and evenly spaced ones will do.
 _MAX_TRIPLES = 400
@@ -21,12 +21,9 @@ _MAX_TRIPLES = 400
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A stretch of a tree between two points at which paths diverge.
+    """A stretch of a tree between points at which paths diverge: the tips beyond it, its rings (n,) from the root.
 
-    Args:
-        tips: those that lie beyond it, from the root.
-        rings: (n,) away from the root. The first is the ring in which the branch diverges from others (not so for the
-            branch that starts at the root), the last the one in which the paths to its tips diverge.
+    The first ring is that in which it diverges from others, the last that in which the paths to its tips diverge.
     """
 
     tips: Tips

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.solvers.tracks import TrackGraph
-from torchreg.spines.name_model import PRIORS, mixture_scales
-from torchreg.spines.student_t import t_log_density
-from torchreg.spines.tip_features import TipObservations
+from torchreg.spines.names.name_model import PRIORS, mixture_scales
+from torchreg.spines.names.student_t import t_log_density
+from torchreg.spines.names.tip_features import TipObservations
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,6 @@ class OrganTracks:
         labels: (T, K) index of each organ's tip in its frame, -1 where the frame lacks it.
         confidence: (T, K) probability that this is what became of its last tip; where the frame lacks it, that of the
             next one; NaN before its birth and after its end.
-        births: (K,) first frame of each organ.
-        ends: (K,) last frame of each organ.
     """
 
     labels: Tensor

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchreg.solvers.assignment import assign
-from torchreg.spines.frame_workers import Job, do_jobs
-from torchreg.spines.name_model import PRIORS, NameModel, relative_maps
-from torchreg.spines.tip_features import TipObservations
+from torchreg.spines.frames.frame_workers import Job, do_jobs
+from torchreg.spines.names.name_model import PRIORS, NameModel, relative_maps
+from torchreg.spines.names.tip_features import TipObservations
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,7 @@ SEARCH = NameSearch()
 
 @dataclass(frozen=True, eq=False)
 class TipNames:
-    """The names of tips over time.
-
-    Args:
-        labels: (T, K) index of each name's tip in its frame, -1 where the frame lacks it.
-        confidence: (T, K) probability of that.
-        reference: frame whose names are certain.
-    """
+    """The tip (T, K) of each name in each frame, -1 for none; its probability (T, K); the frame of certain names."""
 
     labels: Tensor
     confidence: Tensor
@@ -93,11 +87,7 @@ def name_over_time(
 
 
 class _Round:
-    """One search for the names with a fixed model, near ``chosen`` names (K,) of each frame if there are any.
-
-    Attributes: labels (T, K), the most probable names, their log-probability up to a constant, and the probability of
-    each.
-    """
+    """One search for the names with a fixed model, near ``chosen`` names (K,) of each frame if there are any."""
 
     def __init__(
         self, frames: Sequence[TipObservations], reference: int, names: Tensor, model: NameModel,

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.spines.clearance import Clearance, Inside
 from torchreg.spines.labeled_tree import Tips
-from torchreg.spines.limb_curves import JunctionBall, Rings
-from torchreg.spines.tip_trees import TipTree, estimate_junction
+from torchreg.spines.skeleton.clearance import Clearance, Inside
+from torchreg.spines.skeleton.limb_curves import JunctionBall, Rings
+from torchreg.spines.skeleton.tip_trees import TipTree, estimate_junction
 
 
 @dataclass(frozen=True)

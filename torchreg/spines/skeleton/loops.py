@@ -12,8 +12,8 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.graphs import Graph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.surface_graph import one_piece, unique_edges
-from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
-from torchreg.spines.protrusions import Protrusions
+from torchreg.spines.skeleton.level_sets import LevelSets, MeshEdges, level_sets
+from torchreg.spines.skeleton.protrusions import Protrusions
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,7 @@ _CUTTING = LoopCutting()
 
 @dataclass(frozen=True, eq=False)
 class OpenedLoops:
-    """A surface whose long loops are cut, closed again at the C cuts.
-
-    Args:
-        stumps: (C, 2, 3) centers of the two ends of each cut.
-        radii: (C,) half the length of the rim of each cut.
-    """
+    """A surface whose C long loops are cut and closed again: the two ends (C, 2, 3) of each, and half its rim (C,)."""
 
     mesh: TriangleMesh
     stumps: Tensor

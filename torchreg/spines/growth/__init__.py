@@ -1,0 +1,1 @@
+"""Spines of things that grow: organs that appear and end."""
