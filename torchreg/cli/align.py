@@ -121,8 +121,10 @@ def align(
     direction = known_up(up, clouds, camera=views.depth)
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
     output = with_ending(output, (".safetensors",), add=True)
-    old = {"--pose": (pose, ".json .csv"), "--ply": (ply, ".ply"), "--gltf": (gltf, ".glb"), "--rig": (rig, ".glb")}
-    check_old(old, output, f" --rig {shape}" if rig else "")
+    first = numbered(output, 0, len(clouds))
+    check_old({"--pose": (pose, ".json .csv"), "--ply": (ply, ".ply")}, first)
+    check_old({"--gltf": (gltf, ".glb")}, output if first == output else output.with_stem(f"{output.stem}_*"))
+    check_old({"--rig": (rig, ".glb")}, first, f" --rig {shape}")
     files = _Files(output, [with_ending(picture, PICTURE_ENDINGS), pose, ply, rig], gltf, len(clouds))
     files.check(force)
     for path in clouds:

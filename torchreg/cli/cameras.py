@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -71,18 +71,6 @@ def load_calibration(calibration: Path | None, flag: str, scale: float = 1.0) ->
     if calibration is None:
         raise InputError(f"{flag} takes --calibration FILE with the cameras")
     return load_cameras(calibration, scale=scale)
-
-
-def stereo_job(frames: StereoFrames) -> dict[str, Any]:
-    """Return all settings that determine the clouds of stereo pictures, as plain data."""
-    from dataclasses import asdict
-
-    cameras = [
-        [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.distortion.tolist()]
-        for camera in (frames.pair.left, frames.pair.right)
-    ]
-    box = None if frames.box is None else frames.box.tolist()
-    return {"cameras": cameras, "configuration": asdict(frames.config), "--volume": box, "--reach": frames.reach}
 
 
 @dataclass(frozen=True)
@@ -183,3 +171,14 @@ class StereoOptions:
         frames = StereoFrames(folders[0], folders[1], rig.stereo(), config=config, box=box, reach=reach or None)
         frames.sight(0)
         return frames
+
+    def job(self, frames: Any) -> dict[str, Any]:
+        """Return all settings that determine the clouds of stereo pictures, as plain data."""
+        if not self.stereo:
+            return {}
+        cameras = [
+            [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.distortion.tolist()]
+            for camera in (frames.pair.left, frames.pair.right)
+        ]
+        box = None if frames.box is None else frames.box.tolist()
+        return {"cameras": cameras, "configuration": asdict(frames.config), "--volume": box, "--reach": frames.reach}

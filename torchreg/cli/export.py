@@ -89,6 +89,8 @@ def export(
             raise InputError(f"{output} needs what the result does not hold; pass {_NEEDED[name]}")
     if output.with_suffix(".safetensors") in files and output.suffix.lower() == ".json":
         raise InputError(f"{output} is a part of the result; name another output")
+    if not output.suffix:
+        output.mkdir(exist_ok=True)
     check_outputs(writer.files(output, source), force)
     writer.write(output, source)
     if not quiet:

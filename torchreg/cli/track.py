@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import FitShape, NanPolicy, Scale, person_summary
-from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder, stereo_job
+from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
 from torchreg.cli.export import Old, OldWord, check_old
 from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
 from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending
@@ -170,8 +170,8 @@ def track(
         "shape": shape, "shape options": [None if value is None else str(value) for value in astuple(options)],
         "--start": None if first is None else first.tolist(), **settings.job(config), "--fps": fps, "--scale": scale,
         "--nan-policy": nan_policy, "frames": list(clouds.names), **given.job(),
-        **({} if initializer is None else {"--initializer": str(initializer)}),
-        **({"--fit-shape": True} if fit_shape else {}), **(stereo_job(source) if cameras.stereo else {}), **views.job(source),
+        **({} if initializer is None else {"--initializer": str(initializer)}), **cameras.job(source),
+        **({"--fit-shape": True} if fit_shape else {}), **views.job(source),
     }  # fmt: skip
     if fit_shape and not model.coefficient_names:
         model = model.with_bone_coefficients()

@@ -197,7 +197,6 @@ def _track_pictures(path: Path, source: Source) -> None:
         usable=[status.usable for status in track.statuses], up=source.direction,
     )  # fmt: skip
     view = scene_view(scene, margin=0.1)
-    path.mkdir(exist_ok=True)
     for number, picture in enumerate(_frames_of(path, source)):
         save_scene(picture, scene, number, view=view)
 
