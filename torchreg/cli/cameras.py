@@ -82,11 +82,11 @@ class DepthOptions:
     mask: Mask = None
     depth_range: DepthRange = None
 
-    def check(self, *, stereo: bool = False) -> None:
+    def check(self, *, stereo: bool | None = None) -> None:
         """Raise InputError if options are given that have no meaning."""
         check_used(self.depth, "--depth", {"--intrinsics": self.intrinsics, "--mask": self.mask})
-        flag = "--stereo or --depth" if stereo else "--depth"
-        check_used(self.depth or stereo, flag, {"--depth-range": self.depth_range})
+        flag = "--depth" if stereo is None else "--stereo or --depth"
+        check_used(self.depth or bool(stereo), flag, {"--depth-range": self.depth_range})
 
     def source(self, paths: list[Path]) -> DepthFrames:
         """Return the frames of depth pictures."""
