@@ -152,8 +152,10 @@ def registered(tmp_path_factory):
 
 
 def depth_of(mesh, camera):
-    """Return the depths (H, W) of a mesh and whether pixels show it."""
-    raster = rasterize(mesh, camera.view())
+    """Return the depths (H, W) of a mesh in a camera or a view, and whether pixels show it."""
+    raster = rasterize(
+        mesh, camera.view() if hasattr(camera, "view") else camera, cull_back=not hasattr(camera, "view")
+    )
     return raster.depth, raster.face_index >= 0
 
 
