@@ -20,6 +20,7 @@ from torchreg.cli.align_options import (
     Time,
     alignment_summary,
     cloud_files,
+    fitted_shape,
     person_summary,
     read_cloud,
     read_schedule,
@@ -199,8 +200,7 @@ class _AlignRun:
 
         self.start = None if start is None else load_pose(start, self.shape)
         self.initializer = read_initializer(initializer, self.shape, side)
-        if self.fit_shape and not self.shape.coefficient_names:
-            self.shape = self.shape.with_bone_coefficients()
+        self.shape = fitted_shape(self.shape, self.fit_shape)
         if upright:  # where neither --up nor the file say what that is, the first cloud does
             self.config = replace(self.config, upright=self.up or guess_up([as_points(self.read(0))]))
         self.skin = self._skin()

@@ -48,6 +48,11 @@ Support = Annotated[
 ]
 
 
+def fitted_shape(shape: ArticulatedShape, wanted: bool) -> ArticulatedShape:
+    """Return a shape whose coefficients can be fitted, where that is wanted."""
+    return shape.with_bone_coefficients() if wanted and not shape.coefficient_names else shape
+
+
 def read_schedule(text: str | None) -> SigmaSchedule | None:
     """Return the schedule that START:STOP:STEPS describes, None for None."""
     if text is None:

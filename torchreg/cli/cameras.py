@@ -138,10 +138,11 @@ class StereoOptions:
         ),
     ] = None
 
-    def check(self, seen: Path | None) -> None:
-        """Raise InputError if options are given that have no meaning."""
-        views = {"--calibration": self.calibration, "--volume": self.volume, "--matcher": self.matcher}
-        check_used(self.stereo, "--stereo", views | {"--reach": self.reach, "--seen": seen})
+    def check(self, seen: Path | None, views: DepthOptions) -> None:
+        """Raise InputError if options are given that have no meaning, of stereo or of depth pictures."""
+        given = {"--calibration": self.calibration, "--volume": self.volume, "--matcher": self.matcher}
+        check_used(self.stereo, "--stereo", given | {"--reach": self.reach, "--seen": seen})
+        views.check(stereo=self.stereo)
 
     def source(
         self, folders: list[Path], shape: ArticulatedShape, depths: tuple[float, float] | None, scale: float

@@ -106,16 +106,8 @@ def register(
     views = {"--intrinsics": intrinsics, "--depth-range": depth_range, "--smoothing": smoothing, "--seen": seen}
     read = partial(_read, scans, (scale, time, frame), nan_policy)
     if urdf:
-        others = {
-            "--depth": depth,
-            "--weights": weights,
-            "--errors": errors,
-            "--up": up,
-            "--support": support != "auto",
-        }
-        for name, value in (views | others).items():
-            if value:
-                raise InputError(f"{name} has no meaning with --urdf; leave it out")
+        others = {"--weights": weights, "--errors": errors, "--up": up, "--support": support != "auto"}
+        _check_unused({"--depth": depth, **views, **others})
         _write_robot(read, scans, output, bones, grid, force, quiet)
         return
     if len(scans) != 2:
@@ -129,16 +121,12 @@ def register(
     check_used(depth, "--depth", views)
     if depth:
         folder = seen_folder(seen, output, force)
-        images = [_DepthImage.read(*pair) for pair in zip(scans, _cameras(intrinsics), strict=True)]
-        kept = [folder / name for name in ("source.png", "target.png")]
-        pair = [image.scan(depth_range, smoothing or 0.0, path) for image, path in zip(images, kept, strict=True)]
+        images, pair = _depth_pair(scans, intrinsics, depth_range, smoothing or 0.0, folder)
     else:
         pair = read(2)
     if scene is not None and pair[0].faces is None:
         if output.name != _DEFAULT.name:
-            raise InputError(
-                f"{scans[0]} has no triangles, which a .glb needs; name an output that ends in .safetensors"
-            )
+            raise InputError(f"{scans[0]} has no triangles, which a .glb needs; name an output ending in .safetensors")
         scene = None
     found = remembering(_registered(pair, bones, grid, support, quiet), known_up(up, scans, camera=depth))
     found.save(result)
@@ -151,6 +139,25 @@ def register(
         typer.echo(f"{_summary(found)} -> {scene or result}")
     if not found.status.usable:
         raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _check_unused(options: dict[str, Any]) -> None:
+    """Raise InputError if options are given that a robot has no use for."""
+    for name, value in options.items():
+        if value:
+            raise InputError(f"{name} has no meaning with --urdf; leave it out")
+
+
+def _depth_pair(
+    paths: list[Path], intrinsics: list[Path] | None, depths: tuple[float, float] | None, smoothing: float, folder: Path
+) -> tuple[list[_DepthImage], list[RangeScan]]:
+    """Return depth images and their scans, and draw the depths that were kept."""
+    if intrinsics is None or len(intrinsics) > 2:
+        raise InputError("--depth takes --intrinsics FILE once, or twice where source and target have two cameras")
+    cameras = intrinsics[0], intrinsics[-1]
+    images = [_DepthImage.read(*pair) for pair in zip(paths, cameras, strict=True)]
+    kept = [folder / name for name in ("source.png", "target.png")]
+    return images, [image.scan(depths, smoothing, path) for image, path in zip(images, kept, strict=True)]
 
 
 def _read(
@@ -256,12 +263,6 @@ class _DepthImage:
         pixels = self.camera.project(found.deformed.detach().double())[0]
         drawn = picture_with_points(cut_picture(self.depth, self.depth > 0), pixels, found.matched, radius=0)
         save_image(picture, drawn)
-
-
-def _cameras(intrinsics: list[Path] | None) -> tuple[Path, Path]:
-    if intrinsics is None or len(intrinsics) > 2:
-        raise InputError("--depth takes --intrinsics FILE once, or twice where source and target have two cameras")
-    return intrinsics[0], intrinsics[-1]
 
 
 def _summary(found: ScanRegistration) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import FitShape, NanPolicy, Scale, person_summary
+from torchreg.cli.align_options import FitShape, NanPolicy, Scale, fitted_shape, person_summary
 from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
 from torchreg.cli.export import Old, OldWord, check_old
 from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
@@ -143,24 +143,22 @@ def track(
     the result could not be written; 2 for an error; 130 for Ctrl-C.
     """
     result = with_ending(output, (".safetensors",), add=True)
-    files = TrackFiles(result, _movie(movie, result), _moving(gltf, no_gltf, result), pictures, poses, bvh)
-    resumed = resume and files.progress.exists()
-    check_old({"--poses": (poses, ".csv"), "--bvh": (bvh, ".bvh"), "--gltf": (gltf, ".glb")}, result)
-    check_old({"--movie": (movie and files.movie, ""), "--pictures": (pictures, "")}, result, f" --data {frames[0]}")
-    files.check(force or resumed)
-    _check_rates(fps, scale)
-    cameras.check(seen)
-    views.check(stereo=cameras.stereo)
-    model, folder = options.load(shape), None
-    source: Any
+    from torchreg._checks import check_positive
+    from torchreg.storage import load_pose
+    from torchreg.tracking.tracker import Tracker
+
+    files = _files(result, movie, gltf, no_gltf, pictures, poses, bvh, f" --data {frames[0]}")
+    resumed = files.check(force, resume)
+    check_positive(fps, "--fps")
+    check_positive(scale, "--scale")
+    cameras.check(seen, views)
+    model = options.load(shape)
     if cameras.stereo:
-        source = cameras.source(frames, model, views.depth_range, scale)
+        source: Any = cameras.source(frames, model, views.depth_range, scale)
         folder = seen_folder(seen, result, force or resumed)
     else:
         source = views.frames(frames, scale, nan_policy)
     clouds = Clouds(source, floating=not cameras.stereo)
-    from torchreg.storage import load_pose
-
     direction = known_up(up, frames, camera=cameras.stereo or views.depth)
     config = settings.config(direction, clouds)
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
@@ -169,50 +167,40 @@ def track(
     job = {
         "shape": shape, "shape options": [None if value is None else str(value) for value in astuple(options)],
         "--start": None if first is None else first.tolist(), **settings.job(config), "--fps": fps, "--scale": scale,
-        "--nan-policy": nan_policy, "frames": list(clouds.names), **given.job(),
-        **({} if initializer is None else {"--initializer": str(initializer)}), **cameras.job(source),
-        **({"--fit-shape": True} if fit_shape else {}), **views.job(source),
+        "--nan-policy": nan_policy, "frames": list(clouds.names), **given.job(), **cameras.job(source),
+        **views.job(source), **({} if initializer is None else {"--initializer": str(initializer)}),
+        **({"--fit-shape": True} if fit_shape else {}),
     }  # fmt: skip
-    if fit_shape and not model.coefficient_names:
-        model = model.with_bone_coefficients()
-    from torchreg.tracking.tracker import Tracker
-
+    model = fitted_shape(model, fit_shape)
     with claimed(result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
-        tracker = Tracker(
-            model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape
-        )  # fmt: skip
+        tracker = Tracker(model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape)
         run = TrackRun(tracker, clouds, fps, job, files, Report(bar, clouds, quiet), save_every, given, direction)
-        if folder is not None:
+        if cameras.stereo:
             run.seen = _drawn_pictures(source, folder)
         if view:
             run.live = _live_page(pages, port, browser, quiet, direction)
         complete = run.run(resumed)
-    run.write([poses, bvh])
     _report_end(run, model, complete, quiet)
 
 
-def _movie(movie: str | None, result: Path) -> Path | None:
-    """Return where the moving picture goes: by default beside the result."""
+def _files(
+    result: Path, movie: str | None, gltf: Path | None, no_gltf: bool, pictures: Path | None, poses: Path | None,
+    bvh: Path | None, measured: str,
+) -> TrackFiles:  # fmt: skip
+    """Return where the outputs go; the moving picture and the moving shape by default to the name of the result."""
     from torchreg._checks import check_choice
 
-    if movie is not None and Path(movie).suffix.lower() in MOVIES:
-        return Path(movie)
-    check_choice(movie or "gif", "--movie", ("gif", "mp4", "none"))
-    return None if movie == "none" else result.with_suffix(f".{movie or 'gif'}")
-
-
-def _moving(gltf: Path | None, no_gltf: bool, result: Path) -> Path | None:
-    """Return where the moving shape goes: by default beside the result."""
     if gltf is not None and no_gltf:
         raise InputError("--gltf and --no-gltf cannot be used together; leave out either")
-    return None if no_gltf else with_ending(gltf, (".glb",)) or result.with_suffix(".glb")
-
-
-def _check_rates(fps: float, scale: float) -> None:
-    from torchreg._checks import check_positive
-
-    check_positive(fps, "--fps")
-    check_positive(scale, "--scale")
+    moving = Path(movie or "")
+    if moving.suffix.lower() not in MOVIES:
+        check_choice(movie or "gif", "--movie", ("gif", "mp4", "none"))
+        moving = result.with_suffix(f".{movie or 'gif'}")
+    drawn = None if movie == "none" else moving
+    check_old({"--poses": (poses, ".csv"), "--bvh": (bvh, ".bvh"), "--gltf": (gltf, ".glb")}, result)
+    check_old({"--movie": (movie and drawn, ""), "--pictures": (pictures, "")}, result, measured)
+    scene = None if no_gltf else gltf or result.with_suffix(".glb")
+    return TrackFiles(result, drawn, scene, pictures, poses, bvh)
 
 
 def _progress_bar(count: int, quiet: bool) -> Any:
@@ -246,7 +234,8 @@ def _live_page(
 
 
 def _report_end(run: TrackRun, model: ArticulatedShape, complete: bool, quiet: bool) -> None:
-    """Print the summary of a run; raise its exit unless it is complete and usable."""
+    """Write tables and print the summary of a run; raise its exit unless it is complete and usable."""
+    run.write([run.files.poses, run.files.bvh])
     statuses = run.result.statuses
     if not quiet:
         words = filter(None, (summary(run.result), person_summary(model, run.result)))

@@ -57,8 +57,10 @@ class TrackFiles:
         """Return where the picture of a frame goes."""
         return (self.pictures or Path()) / f"frame_{number:04d}.png"
 
-    def check(self, force: bool) -> None:
-        """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
+    def check(self, force: bool, resume: bool) -> bool:
+        """Return whether an earlier run is resumed; raise if an output cannot be written or may not be overwritten."""
+        resumed = resume and self.progress.exists()
+        force = force or resumed
         if self.progress.exists() and not force:
             raise InputError(f"{self.progress} is how far an earlier run got; pass --resume to go on, or --force")
         others = self.result.with_suffix(".json"), self.movie, self.gltf, self.progress, self.poses, self.bvh
@@ -67,6 +69,7 @@ class TrackFiles:
             if self.pictures.is_dir():
                 check_outputs([next(self.pictures.glob("frame_*.png"), None)], force)
             self.pictures.mkdir(exist_ok=True)
+        return resumed
 
 
 class Clouds(Sequence["Tensor"]):
