@@ -40,11 +40,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors."
 
 
 def with_ending(path: Given, endings: Sequence[str], *, add: bool = False) -> Given:
-    """Return the path of an output; InputError if its ending is not allowed.
-
-    With ``add`` the path names a result: the ending of another of its files becomes the first of ``endings``, that of
-    another kind of file is refused, and a name without an ending gets it.
-    """
+    """Return the path of an output; InputError if its ending is not allowed; with ``add`` names of results get it."""
     if path is None or (ending := path.suffix.lower()) in endings:
         return path
     if add and ending in _BESIDE:

@@ -73,14 +73,7 @@ class TrackFiles:
 
 
 class Clouds(Sequence["Tensor"]):
-    """The clouds (M, 3) in metres; those that cannot be read have no points.
-
-    Coordinates far from the origin, as in maps, begin at one near the first cloud: see `origin`.
-
-    Args:
-        frames: the sequence.
-        floating: whether an origin may be chosen.
-    """
+    """The clouds (M, 3) in metres, empty where they cannot be read; far from zero they begin at `origin`."""
 
     def __init__(self, frames: Frames | StereoFrames | DepthFrames, floating: bool = True) -> None:
         self.names, self._frames, self._floating = frames.names, frames, floating
