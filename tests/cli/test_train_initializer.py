@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torchreg as tr
-from torchreg.alignment import train_initializer as train_module
+import torchreg.alignment.train_initializer as train_module
 
 
 def test_weights_are_written_and_loaded(run, tmp_path, monkeypatch):
