@@ -1,26 +1,18 @@
-"""Aligning from the command line: what is printed and written, options, errors, interruptions."""
+"""Aligning from the command line: what is printed and written, options, depth pictures, errors, interruptions."""
 
 import json
 import math
-import warnings
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-import torchreg
+import torchreg as tr
 import torchreg.alignment.align as align_module
-from torchreg.alignment.config import AlignConfig
-from torchreg.cli.hand_side import better_hand
-from torchreg.cli.shape_argument import load_shape
-from torchreg.geometry.upright import guess_up
-from torchreg.io.gltf import load_rig
-from torchreg.io.points import load_points, save_points
-from torchreg.result import Status
-from torchreg.shapes.hand import Hand
-from torchreg.storage import load
+from tests.cli.conftest import depth_of, save_cameras, save_depth, save_picture
+from torchreg.io.points import save_points
 
 QUICK = ("--search", "never")
+CAMERA = tr.Camera(160, 120, (200.0, 200.0, 79.5, 59.5))
 
 
 def watch_align(monkeypatch, interrupted=None):
@@ -44,31 +36,30 @@ def test_one_cloud_is_aligned_and_everything_asked_for_is_written(run, folder, t
         "--gltf", tmp_path / "hand.glb", *QUICK,
     )  # fmt: skip
     assert answer.exit_code == 0, answer.output
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "hand.glb", "p.png", "pose.json", "r.json", "r.safetensors", "skin.ply"
-    ]  # fmt: skip
-    result = load(tmp_path / "r.safetensors")
-    assert f"{int(result.inliers.sum())} of 375 points inliers, rms " in answer.output
-    near = result.distances[result.inliers]
-    assert f"rms {1000 * math.sqrt(sum(d * d for d in near.tolist()) / len(near)):.2f} mm" in answer.output
-    assert result.status.value in answer.output
+    names = ["hand.glb", "p.png", "pose.json", "r.json", "r.safetensors", "skin.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    result = tr.load(tmp_path / "r.safetensors")
+    near = result.distances[result.inliers].tolist()
+    rms = f"rms {1000 * math.sqrt(sum(d * d for d in near) / len(near)):.2f} mm"
+    assert (
+        f"{result.status.value} (confidence {float(result.confidence):.2f}), {len(near)} of 375 points inliers, {rms}"
+    )
+    for name, file in (("pose", "pose.json"), ("ply", "skin.ply"), ("gltf", "hand.glb")):
+        command = f"torchreg export {tmp_path / 'r.safetensors'} -o {tmp_path / file}"
+        assert answer.output.count(f"--{name} goes with the next release; `{command}` writes it") == 1
     named = json.loads((tmp_path / "pose.json").read_text(encoding="utf-8"))
-    assert list(named) == list(Hand().dof_names)
-    assert list(named.values()) == pytest.approx(result.pose.tolist())
-    assert torch.allclose(load_points(tmp_path / "skin.ply").points, result.registered, atol=1e-6)
+    assert named == dict(zip(tr.Hand().dof_names, result.pose.tolist(), strict=True))
+    torch.testing.assert_close(tr.load_points(tmp_path / "skin.ply").points, result.registered, atol=1e-6, rtol=0)
     truth = json.loads((folder / "truth0.json").read_text(encoding="utf-8"))
     assert abs(named["index_mcp_flexion"] - truth["index_mcp_flexion"]) < 0.15
 
 
 def test_joints_that_the_data_do_not_determine_are_printed(run, folder, tmp_path):
-    arm = torchreg.ArticulatedShape.from_urdf(folder / "arm.urdf")
+    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
     skin = arm.file_skin()
     save_points(tmp_path / "cloud.ply", skin(arm.rest_pose())[skin.weights.argmax(-1) < 2])
-    (tmp_path / "start.json").write_text("{}")
-    answer = run(
-        "align", folder / "arm.urdf", tmp_path / "cloud.ply", "-o", tmp_path / "r", "--start", tmp_path / "start.json",
-        *QUICK,
-    )  # fmt: skip
+    command = "align", folder / "arm.urdf", tmp_path / "cloud.ply", "-o", tmp_path / "r", *QUICK
+    answer = run(*command, "--start", folder / "zeros.json")
     assert "not determined by the data: " in answer.output
     assert "rail (+- " in answer.output
 
@@ -81,7 +72,8 @@ def test_what_cannot_be_drawn_or_written_loses_no_result(run, folder, tmp_path, 
         tmp_path / "p.png", "--gltf", tmp_path / "hand.glb", "--quiet", *QUICK,
     )  # fmt: skip
     assert answer.exit_code == 1
-    assert [line.split("/")[-1] for line in answer.output.splitlines()] == [
+    failed = [line.split("/")[-1] for line in answer.output.splitlines() if "is not written" in line]
+    assert failed == [
         f"{name}_{number}.{ending} is not written: ArithmeticError: no room; the result does not suffer"
         for number in (1, 2) for name, ending in (("skin", "ply"), ("p", "png"))
     ]  # fmt: skip
@@ -93,178 +85,154 @@ def test_what_cannot_be_drawn_or_written_loses_no_result(run, folder, tmp_path, 
 
 def test_clouds_are_numbered_and_each_starts_from_the_pose_before(run, folder, tmp_path, monkeypatch):
     starts = watch_align(monkeypatch)
-    clouds = [folder / f"cloud{index}.ply" for index in range(3)]
-    answer = run("align", "hand", *clouds, "-o", tmp_path / "r.safetensors", "--start", folder / "truth0.json", *QUICK)
-    assert answer.exit_code == 0, answer.output
-    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [f"r_{k}.safetensors" for k in (1, 2, 3)]
-    poses = [load(tmp_path / f"r_{k}.safetensors").pose for k in (1, 2, 3)]
+    clouds = [folder / f"cloud{index}.ply" for index in range(2)]
+    command = "align", "hand", *clouds, "-o", tmp_path / "r.safetensors", "--quiet", *QUICK
+    answer = run(*command, "--start", folder / "truth0.json")
+    assert (answer.exit_code, answer.output) == (0, "")
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [f"r_{k}.safetensors" for k in (1, 2)]
+    poses = [tr.load(tmp_path / f"r_{k}.safetensors").pose for k in (1, 2)]
     assert torch.equal(starts[1], poses[0])
+    # A result is a start.
+    run("align", "hand", clouds[0], "-o", tmp_path / "b", "--start", tmp_path / "r_2.safetensors", *QUICK)
     assert torch.equal(starts[2], poses[1])
 
 
 def test_an_interruption_leaves_the_finished_clouds_on_disk(run, folder, tmp_path, monkeypatch):
-    watch_align(monkeypatch, interrupted=2)
+    watch_align(monkeypatch, interrupted=1)
     clouds = [folder / f"cloud{index}.ply" for index in range(4)]
     out = ("-o", tmp_path / "r", "--gltf", tmp_path / "hand.glb", "--start", folder / "truth0.json")
     answer = run("align", "hand", *clouds, *out, *QUICK)
     assert answer.exit_code == 130
-    assert "torchreg: interrupted; 2 of 4 clouds are done" in answer.output
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "hand.glb", "r_1.json", "r_1.safetensors", "r_2.json", "r_2.safetensors"
-    ]  # fmt: skip
+    assert "torchreg: interrupted; 1 of 4 clouds are done" in answer.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.glb", "r_1.json", "r_1.safetensors"]
 
 
-def test_a_result_is_a_start_and_quiet_is_quiet(run, folder, tmp_path, monkeypatch):
-    starts = watch_align(monkeypatch)
-    command = ("align", "hand", folder / "cloud0.ply", "--quiet", *QUICK)
-    answer = run(*command, "-o", tmp_path / "a", "--start", folder / "truth0.json")
-    assert (answer.exit_code, answer.output) == (0, "")
-    assert run(*command, "-o", tmp_path / "b", "--start", tmp_path / "a.safetensors").exit_code == 0
-    assert torch.equal(starts[1], load(tmp_path / "a.safetensors").pose)
-
-
-def test_the_unit_of_the_cloud_and_the_schedule_are_options(run, folder, tmp_path, monkeypatch):
-    meters = load_points(folder / "cloud0.ply").points
+def test_options_reach_the_alignment(run, error_of, folder, tmp_path, interrupted):
+    meters = tr.load_points(folder / "cloud0.ply").points
     save_points(tmp_path / "mm.xyz", 1000 * meters)
-    seen = []
-
-    def noted(shape, data, initial_pose, *, config, **others):
-        seen.append((data, initial_pose, config))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(align_module, "align", noted)
-    run(
-        "align", "hand-left", tmp_path / "mm.xyz", "--scale", "0.001", "--sigma", "0.02:0.005:3", "--outlier", "volume",
-        "--search", "always", "-o", tmp_path / "r",
-    )  # fmt: skip
-    ((data, start, config),) = seen
-    assert torch.allclose(data, meters, atol=1e-6)
-    assert config == AlignConfig(
-        schedule=torchreg.SigmaSchedule.geometric(0.02, 0.005, 3), outlier="volume", search="always"
-    )
+    given = interrupted("torchreg.alignment.align.align")
+    common = "-o", tmp_path / "r"
+    options = "--sigma", "0.02:0.005:3", "--outlier", "volume", "--search", "always"
+    run("align", "hand-left", tmp_path / "mm.xyz", "--scale", "0.001", *options, *common)
+    (_, data, start), known = given.pop()
+    torch.testing.assert_close(data, meters, atol=1e-6, rtol=0)
+    schedule = tr.SigmaSchedule.geometric(0.02, 0.005, 3)
+    assert known["config"] == tr.AlignConfig(schedule=schedule, outlier="volume", search="always")
     assert start is None  # the shape is searched for
+    upright = "align", "hand", folder / "cloud0.ply", *common, "--upright"
+    for more in (["--up", "x"], []):
+        run(*upright, *more)
+    told, guessed = (options["config"].upright for _, options in given)
+    assert told == (1, 0, 0) != guessed
+    assert "--upright is of a search" in error_of(*upright, "--start", folder / "truth0.json")
 
 
 def test_millimeters_taken_for_meters_are_warned_of(run, folder, tmp_path):
-    save_points(tmp_path / "mm.ply", 1000 * load_points(folder / "cloud0.ply").points)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        answer = run("align", "hand", tmp_path / "mm.ply", "-o", tmp_path / "r", *QUICK)
+    save_points(tmp_path / "mm.ply", 1000 * tr.load_points(folder / "cloud0.ply").points)
+    answer = run("align", "hand", tmp_path / "mm.ply", "-o", tmp_path / "r", *QUICK)
     assert answer.exit_code == 1, answer.output
     assert "torchreg: warning: the data spread over" in answer.output
-    assert load(tmp_path / "r.safetensors").status is Status.FEW_INLIERS
+    assert tr.load(tmp_path / "r.safetensors").status is tr.Status.FEW_INLIERS
 
 
 def test_points_that_are_not_finite_are_refused_or_left_out(run, error_of, folder, tmp_path):
-    text = "nan 0 0\n" + "\n".join(" ".join(map(str, p)) for p in load_points(folder / "cloud0.ply").points.tolist())
-    (tmp_path / "c.xyz").write_text(text, encoding="utf-8")
+    points = tr.load_points(folder / "cloud0.ply").points.tolist()
+    (tmp_path / "c.xyz").write_text("nan 0 0\n" + "\n".join(" ".join(map(str, point)) for point in points))
     command = ("align", "hand", tmp_path / "c.xyz", "-o", tmp_path / "r", "--start", folder / "truth0.json", *QUICK)
     assert "1 of 376 points are not finite" in error_of(*command)
     assert run(*command, "--nan-policy", "omit").exit_code == 0
+    (tmp_path / "damaged.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 5\n")
+    assert "damaged.ply: " in error_of("align", "hand", tmp_path / "damaged.ply", "-o", tmp_path / "d")
 
 
 def test_a_robot_is_aligned(run, folder, tmp_path):
-    (tmp_path / "rest.json").write_text('{"shoulder": 0.0}', encoding="utf-8")
     command = ("align", folder / "arm.urdf", folder / "arm.npz", *QUICK)
-    answer = run(*command, "-o", tmp_path / "free", "--start", tmp_path / "rest.json")
+    answer = run(*command, "-o", tmp_path / "free", "--start", folder / "zeros.json")
     assert answer.exit_code == 0, answer.output
-    assert abs(load(tmp_path / "free.safetensors").pose[0].item() - 0.02) < 0.005
-    # Its data lie two centimetres beside where its base is held.
+    assert abs(tr.load(tmp_path / "free.safetensors").pose[0].item() - 0.02) < 0.005
+    # Its data lie two centimetres off where its base is held.
     answer = run(*command, "-o", tmp_path / "fixed", "--fixed-base")
     assert answer.exit_code == 1
     assert "data lie beside the shape's surface" in answer.output
-    assert abs(load(tmp_path / "fixed.safetensors").pose[0].item()) < 0.005
+    assert abs(tr.load(tmp_path / "fixed.safetensors").pose[0].item()) < 0.005
 
 
-@pytest.fixture(scope="module")
-def rig_aligned(run, error_of, folder, tmp_path_factory):
-    """The answer to a rig whose joints know no parents, aligned to its own vertices, and the result."""
+def test_known_joints_hold_a_robot_and_what_is_open_is_printed(run, error_of, folder, tmp_path):
+    table, robot = tmp_path / "joints.csv", folder / "arm.urdf"
+    table.write_text("shoulder,rail\n0.05,0.01\n")
+    command = "align", robot, folder / "arm.npz", "-o", tmp_path / "known"
+    answer = run(*command, "--locked", "base", "--joints", table, "--joint-std", "20deg", *QUICK)
+    assert answer.exit_code in (0, 1), answer.output
+    assert not tr.load(tmp_path / "known.safetensors").pose[:6].any()
+    command = *command[:3], "-o", tmp_path / "bad"
+    for options, message in [
+        (["--joint-std", "1deg"], "no meaning without --joints"),
+        (["--joints", table, "--joint-std", "wide"], "--joint-std must be a positive angle as in 0.5deg"),
+        (["--locked", "elbow"], "locked names 'elbow', which is no degree of freedom"),
+    ]:
+        assert message in error_of(*command, *options)
+    table.write_text("shoulder,rail\n50,0.01\n")
+    assert "angles are radians" in error_of(*command, "--joints", table)
+
+
+def test_a_rig_with_a_flat_hierarchy_is_aligned(run, error_of, folder, tmp_path):
     assert "3 roots" in error_of("info", folder / "flat.glb")
-    out = tmp_path_factory.mktemp("rig") / "r"
-    answer = run(
-        "align", folder / "flat.glb", folder / "flat.glb", "--parents", folder / "parents.json", "-o", out, *QUICK
-    )
-    return answer, load(out.with_suffix(".safetensors"))
+    rig = "align", folder / "flat.glb", folder / "flat.glb", "--parents", folder / "parents.json", *QUICK
+    answer = run(*rig, "-o", tmp_path / "r")
+    assert answer.exit_code == 0, answer.output  # an exact fit is not doubtful
+    assert tr.load(tmp_path / "r.safetensors").distances.abs().median() < 0.002
 
 
 def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of, tmp_path):
     rig, parents = folder / "flat.glb", folder / "parents.json"
-    cloud = load_rig(rig).vertices * 1.1
-    save_points(tmp_path / "cloud.ply", cloud)
+    save_points(tmp_path / "cloud.ply", tr.load_mesh(rig).vertices * 1.1)
     common = "align", rig, tmp_path / "cloud.ply", "--parents", parents, "-o", tmp_path / "r"
-    answer = run(*common, "--fit-shape", "--start", zeros(tmp_path, rig, parents), "--rig", tmp_path / "new.glb")
+    answer = run(*common, "--fit-shape", "--start", folder / "zeros.json", "--rig", tmp_path / "new.glb", *QUICK)
     assert answer.exit_code in (0, 1), answer.output
-    found = load(tmp_path / "r.safetensors")
-    written = load_shape(str(tmp_path / "new.glb"), parents)
+    assert "; size -0.0" in answer.output or "; size 0." in answer.output
+    found = tr.load(tmp_path / "r.safetensors")
+    joined = json.loads(parents.read_text(encoding="utf-8"))
+    written = tr.ArticulatedShape.from_gltf(tmp_path / "new.glb", parents=joined)
     torch.testing.assert_close(written(found.pose).points, found.shape(found.pose).points, atol=1e-5, rtol=0)
     assert "--rig has no meaning without --fit-shape" in error_of(*common, "--rig", tmp_path / "n.glb")
     hand = "align", "hand", tmp_path / "cloud.ply", "--fit-shape", "--rig", tmp_path / "n.glb"
     assert "--rig has no meaning for hand" in error_of(*hand)
 
 
-def test_an_upright_shape_is_sought_about_the_vertical(run, error_of, folder, tmp_path, monkeypatch):
-    asked = []
-
-    def noted(shape, data, initial_pose, *, config, **options):
-        asked.append(config.upright)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("torchreg.alignment.align.align", noted)
-    common = "align", "hand", folder / "cloud0.ply", "-o", tmp_path / "r", "--upright"
-    run(*common, "--up", "x")
-    run(*common)
-    assert asked == [(1, 0, 0), guess_up([load_points(folder / "cloud0.ply").points])]
-    assert "--upright is of a search" in error_of(*common, "--start", folder / "truth0.json")
+@pytest.fixture(scope="module")
+def files(folder, tmp_path_factory):
+    """Files with which an alignment ends."""
+    place = tmp_path_factory.mktemp("bad")
+    (place / "list.json").write_text("[1]", encoding="utf-8")
+    return place
 
 
-def zeros(place, rig, parents):
-    """Return the file of a pose at rest."""
-    names = load_shape(str(rig), parents).dof_names
-    (place / "rest.json").write_text(json.dumps(dict.fromkeys(names, 0.0)), encoding="utf-8")
-    return place / "rest.json"
-
-
-def test_a_rig_with_a_flat_hierarchy_is_aligned(rig_aligned):
-    assert rig_aligned[1].distances.abs().median() < 0.002
-
-
-def test_an_exact_fit_of_a_rig_is_not_doubtful(rig_aligned):
-    assert rig_aligned[0].exit_code == 0, rig_aligned[0].output
-
-
-def test_errors_are_one_line(error_of, folder, tmp_path):
-    cloud, out = folder / "cloud0.ply", ("-o", tmp_path / "r")
-    damaged = tmp_path / "damaged.ply"
-    damaged.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 5\n")
-    (tmp_path / "list.json").write_text("[1]", encoding="utf-8")
-    for arguments, message in [
-        ((cloud, tmp_path / "none.ply", *out), "none.ply: No such file or directory"),
-        ((damaged, *out), "damaged.ply: "),
-        ((cloud, *out, "--start", tmp_path / "none.json"), "none.json: No such file or directory"),
-        ((cloud, *out, "--start", tmp_path / "list.json"), "list.json must have shape (27)"),
-        ((cloud, *out, "--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
-        ((cloud, *out, "--sigma", "0.01:0.02:5"), "stop must not exceed start"),
-        ((cloud, *out, "--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
-        ((cloud, *out, "--scale", "0"), "--scale must be positive and finite, got 0.0"),
-        ((cloud, *out, "--fixed-base"), "--free-base/--fixed-base has no meaning for hand"),
-        ((cloud, *out, "--parents", folder / "parents.json"), "--parents has no meaning for hand"),
-        ((cloud, "-o", tmp_path / "no" / "r"), "no does not exist; create it first"),
-        ((cloud, *out, "--picture", tmp_path / "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
-        ((cloud, *out, "--pose", tmp_path / "r.json"), "two outputs would be called"),
-    ]:
-        assert message in error_of("align", "hand", *arguments), arguments
-    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".ply"]
-
-
-def test_either_hand_is_the_one_that_leaves_less_unexplained():
-    def align(hand, costs=(2.0, 1.0), confidences=(0.9, 0.5), counts=(9, 9)):
-        left = hand.side == "left"
-        return SimpleNamespace(
-            cost=torch.tensor(costs[left]), confidence=torch.tensor(confidences[left]), distances=[0] * counts[left]
-        )
-
-    assert better_hand(align).side == "left"
-    assert better_hand(lambda hand: align(hand, counts=(9, 8))).side == "right"
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("none.ply",), "none.ply: No such file or directory"),
+        (("--start", "none.json"), "none.json: No such file or directory"),
+        (("--start", "list.json"), "list.json must have shape (27)"),
+        (("--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
+        (("--sigma", "a:b:c"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
+        (("--sigma", "0.01:0.02:5"), "stop must not exceed start"),
+        (("--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
+        (("--scale", "0"), "--scale must be positive and finite, got 0.0"),
+        (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand; leave it out"),
+        (("--parents", "list.json"), "--parents has no meaning for hand"),
+        (("-o", "no/r.x"), "no does not exist; create it first"),
+        (("--picture", "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
+        (("--pose", "r.json"), "two outputs would be called"),
+        (("--ply", "r.obj"), "r.obj must end in .ply"),
+        (("--side", "up"), "--side must be one of right, left, either"),
+        (("--intrinsics", "list.json"), "--intrinsics has no meaning without --depth"),
+        (("--depth",), "--depth takes --intrinsics FILE with the camera"),
+    ],
+)
+def test_errors_are_one_line(error_of, folder, files, arguments, message):
+    words = [files / word if "." in word and ":" not in word and not word[0].isdigit() else word for word in arguments]
+    assert message in error_of("align", "hand", folder / "cloud0.ply", "-o", files / "r", *words)
+    assert sorted(path.name for path in files.iterdir()) == ["list.json"]
 
 
 def test_the_side_of_a_hand(run, error_of, folder, tmp_path):
@@ -272,27 +240,90 @@ def test_the_side_of_a_hand(run, error_of, folder, tmp_path):
     answer = run("align", "hand", folder / "cloud0.ply", "--side", "either", *out)
     assert answer.exit_code == 0
     assert "cloud0.ply: a right hand" in answer.output
-    assert "--side must be one of right, left, either" in error_of(
-        "align", "hand", folder / "cloud0.ply", "--side", "up"
-    )
-    assert "--side has no meaning for hand-left" in error_of(
-        "align", "hand-left", folder / "cloud0.ply", "--side", "left"
-    )
+    other = error_of("align", "hand-left", folder / "cloud0.ply", "--side", "left")
+    assert "--side has no meaning for hand-left" in other
 
 
-def test_known_joints_hold_a_robot_and_what_is_open_is_told(run, error_of, folder, tmp_path):
-    table, robot = tmp_path / "joints.csv", folder / "arm.urdf"
-    table.write_text("shoulder,rail\n0.05,0.01\n")
-    known = ["--locked", "base", "--joints", table, "--joint-std", "20deg"]
-    answer = run("align", robot, folder / "arm.npz", *known, "--search", "never", "-o", tmp_path / "known")
-    assert answer.exit_code in (0, 1), answer.output
-    pose = load(tmp_path / "known.safetensors").pose
-    assert not pose[:6].any()
-    out = ["-o", tmp_path / "bad"]
-    assert "no meaning without --joints" in error_of("align", robot, folder / "arm.npz", "--joint-std", "1deg", *out)
-    wrong = error_of("align", robot, folder / "arm.npz", "--joints", table, "--joint-std", "wide", *out)
-    assert "--joint-std must be a positive angle as in 0.5deg" in wrong
-    named = error_of("align", robot, folder / "arm.npz", "--locked", "elbow", *out)
-    assert "locked names 'elbow', which is no degree of freedom" in named
-    table.write_text("shoulder,rail\n50,0.01\n")
-    assert "angles are radians" in error_of("align", robot, folder / "arm.npz", "--joints", table, *out)
+@pytest.fixture(scope="module")
+def pictures(plain_hand, plain_hand_surface, tmp_path_factory):
+    """Two depth pictures of a hand before a wall with their masks, its camera, keypoints and pose."""
+    place = tmp_path_factory.mktemp("pictures")
+    pose = plain_hand.rest_pose()
+    pose[:3], pose[3] = torch.tensor([0.0, 0.06, 0.5]), 1.5
+    keypoints = []
+    for name in ("depth", "masks"):
+        (place / name).mkdir()
+    for number in range(2):
+        pose[0] = 0.004 * number
+        keypoints.append(CAMERA.project(plain_hand.keypoints(pose))[0].tolist())
+        depth, shown = depth_of(tr.TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces), CAMERA)
+        save_depth(place / "depth" / f"{number}.png", torch.where(shown, depth, 0.9), 1e-4)
+        save_picture(place / "masks" / f"{number}.png", shown)
+    keypoints[0][3] = None
+    (place / "keypoints.json").write_text(json.dumps(keypoints), encoding="utf-8")
+    save_cameras(place / "camera.json", CAMERA, depth_scale=1e-4)
+    (place / "start.json").write_text(json.dumps(pose.tolist()), encoding="utf-8")
+    return place
+
+
+def of_pictures(pictures, tmp_path):
+    return (
+        "--depth", "--intrinsics", pictures / "camera.json", "--mask", pictures / "masks", "--start",
+        pictures / "start.json", "-o", tmp_path / "r", "--quiet",
+    )  # fmt: skip
+
+
+def test_pictures_of_a_pattern_are_aligned(run, pictures, tmp_path):
+    answer = run("align", "hand", pictures / "depth" / "*.png", *of_pictures(pictures, tmp_path), *QUICK)
+    assert answer.exit_code == 0, answer.output
+    first, second = (tr.load(tmp_path / f"r_{number}.safetensors") for number in (1, 2))
+    assert float(second.pose[0] - first.pose[0]) == pytest.approx(0.004, abs=1e-3)
+    assert 0.5 < float(first.confidence) <= 1
+    frame = tr.DepthFrame.load(
+        pictures / "depth" / "0.png", pictures / "camera.json", pictures / "masks" / "0.png"
+    )  # fmt: skip
+    assert len(first.distances) == len(frame.points)
+
+
+def test_a_shape_found_in_a_whole_picture_is_drawn_over_the_points_of_its_crop(run, pictures, tmp_path):
+    answer = run(
+        "align", "hand", pictures / "depth" / "0.png", "--depth", "--intrinsics", pictures / "camera.json", "-o",
+        tmp_path / "r", "--picture", tmp_path / "p.png", "--quiet",
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert (tmp_path / "p.png").stat().st_size > 0
+    result = tr.load(tmp_path / "r.safetensors")
+    frame = tr.DepthFrame.load(pictures / "depth" / "0.png", pictures / "camera.json")
+    assert result.inliers.shape == (len(result.points_of(frame)),) != (len(frame.points),)
+
+
+def test_a_folder_of_pictures_is_tracked_with_keypoints_in_them(run, error_of, pictures, tmp_path):
+    command = "track", "hand", pictures / "depth", *of_pictures(pictures, tmp_path), "--movie", "none", "--no-gltf"
+    answer = run(*command, "--keypoints", pictures / "keypoints.json", "--keypoint-std", 4)
+    assert answer.exit_code == 0, answer.output
+    assert all(status.usable for status in tr.load(tmp_path / "r.safetensors").statuses)
+    one = "align", "hand", pictures / "depth" / "0.png", *of_pictures(pictures, tmp_path)[:3], "-o", tmp_path / "k"
+    keypoints = "--keypoints", pictures / "keypoints.json"
+    assert "keypoints.json must hold the keypoints of every frame, 1; got those of 2" in error_of(*one, *keypoints)
+    assert "--keypoint-std has no meaning without --keypoints" in error_of(*one, "--keypoint-std", "4")
+    dark = "--mask", pictures / "depth" / "0.png", "--depth-range", "5", "6"
+    assert "0.png: depth" in error_of(*one, *dark)
+
+
+def test_frames_become_labels(run, error_of, pictures, folder, plain_hand, tmp_path):
+    picture, mask = pictures / "depth" / "1.png", pictures / "masks" / "1.png"
+    depth = "--depth", "--intrinsics", pictures / "camera.json", "--mask", mask
+    start = "--trusted", 0, "--start"
+    given = "label", "hand", picture, *depth, *start, pictures / "start.json", "-o", tmp_path / "pictures"
+    clouds = folder / "cloud0.ply", folder / "cloud1.ply"
+    command = "label", "hand", *clouds, "-o", tmp_path / "clouds", *start, folder / "truth0.json"
+    for words, count in ((given, 1), (command, 2)):
+        answer = run(*words)
+        assert answer.exit_code == 0, answer.output
+        labels = sorted((words[words.index("-o") + 1]).glob("*.safetensors"))
+        assert [path.name for path in labels] == [f"label_{number:06d}.safetensors" for number in range(count)]
+        for path in labels:
+            assert f"-> {path}" in answer.output
+    assert "exists; pass --force" in error_of(*command)
+    assert "missing.ply" in error_of("label", "hand", "missing.ply")
+    assert "--mask has no meaning without --depth" in error_of("label", "hand", *clouds, "--mask", mask)

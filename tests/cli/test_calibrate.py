@@ -6,29 +6,26 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-import torchreg.alignment.calibrate as calibrate_module
-from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.rigid import rigid_matrix, transform_points
-from torchreg.geometry.rotation import so3_exp
+import torchreg as tr
 from torchreg.geometry.visibility import sample_visible
 from torchreg.io.points import save_points
-from torchreg.result import Status
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.storage import load
 
-BASE = rigid_matrix(so3_exp(torch.tensor([[1.7, 0.3, -0.2]]))[0], torch.tensor([0.1, 0.2, 1.1]))
+BASE = torch.eye(4)
+BASE[:3, :3] = torch.from_numpy(Rotation.from_rotvec([1.7, 0.3, -0.2]).as_matrix())
+BASE[:3, 3] = torch.tensor([0.1, 0.2, 1.1])
 
 
 @pytest.fixture(scope="module")
 def clouds(folder):
     """Two clouds of the robot's side towards the camera, and the table of its joints."""
-    arm = ArticulatedShape.from_urdf(folder / "arm.urdf")
+    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
     skin = arm.file_skin()
     lines = ["shoulder,rail,time"]
     for number, (shoulder, rail) in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
-        vertices = transform_points(BASE, skin(torch.tensor([0.0] * 6 + [shoulder, rail])))
-        points = sample_visible(TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
+        vertices = skin(torch.tensor([0.0] * 6 + [shoulder, rail])) @ BASE[:3, :3].T + BASE[:3, 3]
+        points = sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
         save_points(folder / f"robot{number}.ply", points)
         lines.append(f"{shoulder},{rail},{number}")
     (folder / "joints.csv").write_text("\n".join(lines) + "\n")
@@ -42,7 +39,7 @@ def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, t
     assert answer.exit_code == 0, answer.output
     assert "base within" in answer.output
     written = json.loads((tmp_path / "base_transform.json").read_text())
-    found = load(tmp_path / "base.safetensors")
+    found = tr.load(tmp_path / "base.safetensors")
     assert written["T_camera_base"] == found.T_camera_base.tolist()
     assert "static_transform_publisher --x" in written["ros2"]
     assert written["ros2"].endswith("--child-frame-id base")
@@ -96,10 +93,10 @@ def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(ru
     assert float(re.search(r"lengths ([\d.]+) times those of the shape", answer.output)[1]) == pytest.approx(
         1, abs=0.05
     )
-    found = load(tmp_path / "hand.safetensors")
+    found = tr.load(tmp_path / "hand.safetensors")
     assert found.poses.shape == (2, 27)
-    doubtful = replace(found, outliers=(1,), status=Status.WITH_WARNINGS)
-    monkeypatch.setattr(calibrate_module, "calibrate", lambda *given: doubtful)
+    doubtful = replace(found, outliers=(1,), status=tr.Status.WITH_WARNINGS)
+    monkeypatch.setattr("torchreg.alignment.calibrate.calibrate", lambda *given: doubtful)
     answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
     assert answer.exit_code == 0
     assert answer.output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"

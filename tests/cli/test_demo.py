@@ -4,13 +4,8 @@ import json
 
 import torch
 
-import torchreg.tracking.recovery as recovery_module
-from torchreg.alignment.results import PoseStarts
+import torchreg as tr
 from torchreg.datasets.hand import hand_motion
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.hand import Hand
-from torchreg.storage import load
-from torchreg.tracking.tracker import Tracker
 
 
 def test_the_demonstration_runs(run, tmp_path):
@@ -19,9 +14,9 @@ def test_the_demonstration_runs(run, tmp_path):
     assert answer.exit_code == 0, answer.output
     names = ["hand.glb", "poses.json", "track.json", "track.safetensors", "tracking.gif"]
     assert sorted(path.name for path in out.iterdir()) == names
-    result = load(out / "track.safetensors")
+    result = tr.load(out / "track.safetensors")
     poses = json.loads((out / "poses.json").read_text(encoding="utf-8"))
-    assert tuple(poses["poses"]) == Hand().dof_names
+    assert tuple(poses["poses"]) == tr.Hand().dof_names
     assert poses["poses"]["index_pip_flexion"] == result.track.named_poses["index_pip_flexion"].tolist()
     lines = answer.stdout.splitlines()
     first, second, third = result.track.seconds.tolist()
@@ -37,12 +32,12 @@ def test_the_demonstration_runs(run, tmp_path):
         assert line == f"fingertip error, {which}: {values}"
     assert all(name in lines[-1] for name in names)
     assert run("demo", "--frames", "1", "-o", out).exit_code == 2
-    skin = ArticulatedShape.from_gltf(out / "hand.glb")
+    skin = tr.ArticulatedShape.from_gltf(out / "hand.glb")
     assert skin.part_names[0] == "palm"
 
 
 def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeypatch):
-    step = Tracker.step
+    step = tr.Tracker.step
 
     def interrupted(self, points, time=None, **told):
         if self.state.frame == 1:
@@ -50,13 +45,13 @@ def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeyp
         return step(self, points, time, **told)
 
     # Where the hand is in the first frame is told, not searched for.
-    truth = hand_motion(Hand(), "bending_palm", 2)[:1]
-    starts = PoseStarts(truth, torch.zeros(1), torch.ones(()))
-    monkeypatch.setattr(recovery_module, "find_pose", lambda *arguments, **options: starts)
-    monkeypatch.setattr(Tracker, "step", interrupted)
+    truth = hand_motion(tr.Hand(), "bending_palm", 2)[:1]
+    starts = tr.PoseStarts(truth, torch.zeros(1), torch.ones(()))
+    monkeypatch.setattr("torchreg.tracking.recovery.find_pose", lambda *arguments, **options: starts)
+    monkeypatch.setattr(tr.Tracker, "step", interrupted)
     answer = run("demo", "--frames", "2", "-o", tmp_path, "--no-movie")
     assert answer.exit_code == 130
     assert "torchreg: interrupted; 1 of 2 frames are done" in answer.output
     names = ["hand.glb", "poses.json", "track.json", "track.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
-    assert load(tmp_path / "track.safetensors").track.poses.shape == (1, 27)
+    assert tr.load(tmp_path / "track.safetensors").track.poses.shape == (1, 27)

@@ -1,154 +1,122 @@
-"""Registration from the command line: files, their contents, exit codes, refusals."""
+"""Registration and posing from the command line: files, their contents, exit codes, refusals."""
 
 import functools
-import math
-import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import torchreg as tr
-from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.geometry.camera import Camera
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.geometry.visibility import rasterize
-from torchreg.io.calibration import load_depth_camera, save_depth_camera
-from torchreg.io.images import load_image, save_depth
-from torchreg.io.points import load_points, save_points
+from tests.cli.conftest import depth_of, save_cameras, save_depth
+from torchreg.io.points import save_points
 from torchreg.registration import register as pipeline
-from torchreg.registration import register_sequence
-from torchreg.registration.robots.model import RobotModel
+
+SMALL = ("--bones", 6, "--grid", 25)
 
 
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    """Return two scans on disk, and a registration that starts from the truth."""
-    folder = tmp_path_factory.mktemp("scans")
-    pair = jointed_toy(2, seed=2, scanner=DepthScanner(num_points=800), step=math.radians(20)).pair(0, 1)
-    for name, scan in (("source", pair.source), ("target", pair.target)):
-        save_points(folder / f"{name}.ply", scan.points, faces=scan.faces)
-    save_points(folder / "bare.ply", pair.source.points)
-    return folder, functools.partial(pipeline.register, start=pair.truth)
+@pytest.fixture
+def pair(registered, monkeypatch):
+    """Two scans on disk, whose registration starts from the truth."""
+    place, _, truth = registered
+    monkeypatch.setattr(pipeline, "register", functools.partial(pipeline.register, start=truth))
+    return place / "source.ply", place / "target.ply"
 
 
-def test_a_pair_becomes_a_scene_a_result_and_pictures(run, scans, tmp_path, monkeypatch):
-    folder, known = scans
-    monkeypatch.setattr(pipeline, "register", known)
-    answer = run(
-        "register", folder / "source.ply", folder / "target.ply", "-o", tmp_path / "out.glb", "--bones", 6,
-        "--grid", 25, "--weights", tmp_path / "bones.ply", "--errors", tmp_path / "errors.ply",
-    )  # fmt: skip
+def test_a_pair_becomes_a_scene_and_a_result(run, pair, tmp_path):
+    old = {"--weights": "bones.ply", "--errors": "distance.ply"}
+    given = [word if word in old else tmp_path / word for row in old.items() for word in row]
+    answer = run("register", *pair, "-o", tmp_path / "out.glb", *SMALL, *given)
     assert answer.exit_code == 0, answer.output
     assert "bones" in answer.output
     assert "refine" in answer.output
-    assert (tmp_path / "out.glb").read_bytes()[:4] == b"glTF"
     found = tr.load(tmp_path / "out.safetensors")
     assert 1 < found.model.num_bones <= 6
-    for name in ("bones.ply", "errors.ply"):
-        torch.testing.assert_close(load_points(tmp_path / name).points, found.deformed, atol=1e-5, rtol=0)
+    for option, name in old.items():
+        assert answer.output.count(f"{option} goes with the next release") == 1
+        run("export", tmp_path / "out", "-o", tmp_path / "e.ply", "--color", name[:-4], "--force")
+        assert (tmp_path / "e.ply").read_bytes() == (tmp_path / name).read_bytes()
+        torch.testing.assert_close(tr.load_points(tmp_path / name).points, found.deformed, atol=1e-5, rtol=0)
+    run("export", tmp_path / "out", "-o", tmp_path / "e.glb")
+    assert (tmp_path / "e.glb").read_bytes() == (tmp_path / "out.glb").read_bytes()
 
 
-def test_what_scans_stand_on_is_left_out(run, error_of, scans, tmp_path, monkeypatch):
-    folder, _ = scans
-    asked = []
-    monkeypatch.setattr(pipeline, "register", lambda *_, **given: asked.append(given["support"]) or sys.exit(3))
+def test_what_scans_stand_on_is_left_out(run, error_of, registered, tmp_path, interrupted):
+    given = interrupted("torchreg.registration.register.register")
+    scans = [registered[0] / f"{name}.ply" for name in ("source", "target")]
     for option in ([], ["--support", "keep"]):
-        run("register", folder / "source.ply", folder / "target.ply", "-o", tmp_path / "out.glb", *option)
-    assert asked == ["auto", "keep"]
-    assert "no meaning with --urdf" in error_of("register", folder, "--urdf", "--support", "keep")
+        run("register", *scans, "-o", tmp_path / "out.glb", *option)
+    assert [options["support"] for _, options in given] == ["auto", "keep"]
 
 
-def test_what_cannot_be_drawn_or_written_loses_no_result(run, scans, tmp_path, monkeypatch, failing):
-    folder, known = scans
-    monkeypatch.setattr(pipeline, "register", known)
+def test_what_cannot_be_drawn_or_written_loses_no_result(run, pair, tmp_path, failing):
     failing("torchreg.viz.scan_gltf.save_grid_animation", "torchreg.viz.bone_colors.save_weight_ply")
-    answer = run(
-        "register", folder / "source.ply", folder / "target.ply", "-o", tmp_path / "out.glb", "--bones", 6, "--grid",
-        25, "--weights", tmp_path / "bones.ply", "--errors", tmp_path / "errors.ply", "--quiet",
-    )  # fmt: skip
+    old = "--weights", tmp_path / "bones.ply", "--errors", tmp_path / "errors.ply"
+    answer = run("register", *pair, "-o", tmp_path / "out.glb", *SMALL, *old, "--quiet")
     assert answer.exit_code == 1
     assert sum("is not written: ArithmeticError" in line for line in answer.output.splitlines()) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["errors.ply", "out.json", "out.safetensors"]
 
 
-def test_what_cannot_be_written_is_told_first(run, error_of, scans, tmp_path, monkeypatch):
-    folder, known = scans
-    monkeypatch.setattr(pipeline, "register", known)
-    pair = folder / "bare.ply", folder / "target.ply"
-    assert "has no triangles" in error_of("register", *pair, "-o", tmp_path / "out.glb")
-    assert "must end in" in error_of("register", *pair, "-o", tmp_path / "out.obj")
-    answer = run("register", *pair, "-o", tmp_path / "out.safetensors", "--quiet", "--grid", 25)
-    assert answer.exit_code == 0, answer.output
-    assert answer.output == ""
-    assert "exists" in error_of("register", *pair, "-o", tmp_path / "out.safetensors")
-    assert "num_bones" in error_of("register", *pair, "-o", tmp_path / "no.safetensors", "--bones", 0)
+def test_clouds_without_triangles_and_what_is_refused_first(run, error_of, pair, tmp_path):
+    source, target = pair
+    bare = source.with_name("bare.ply"), target
+    assert "has no triangles" in error_of("register", *bare, "-o", tmp_path / "out.glb")
+    assert "must end in" in error_of("register", *bare, "-o", tmp_path / "out.obj")
+    answer = run("register", *bare, "-o", tmp_path / "out.safetensors", "--quiet", "--grid", 25)
+    assert (answer.exit_code, answer.output) == (0, "")
+    assert "exists" in error_of("register", *bare, "-o", tmp_path / "out.safetensors")
+    assert "has no triangles" in error_of("export", tmp_path / "out", "-o", tmp_path / "out.glb")
+    assert "num_bones" in error_of("register", *bare, "-o", tmp_path / "no.safetensors", "--bones", 0)
     assert not (tmp_path / "no.safetensors").exists()
 
 
-def test_scans_that_have_nothing_in_common_end_with_one(run, scans, tmp_path, monkeypatch):
-    folder, known = scans
-    monkeypatch.setattr(pipeline, "register", known)
-    far = load_points(folder / "target.ply")
-    save_points(tmp_path / "far.ply", far.points + 100.0)
-    answer = run("register", folder / "source.ply", tmp_path / "far.ply", "-o", tmp_path / "far.safetensors")
+def test_scans_that_have_nothing_in_common_end_with_one(run, pair, tmp_path):
+    save_points(tmp_path / "far.ply", tr.load_points(pair[1]).points + 100.0)
+    answer = run("register", pair[0], tmp_path / "far.ply", "-o", tmp_path / "far.safetensors")
     assert answer.exit_code == 1, answer.output
     assert "no_data" in answer.output
 
 
-@pytest.fixture(scope="module")
-def depth_images(tmp_path_factory):
-    """Depth images of a toy in two poses, their camera, and a registration that starts from the truth."""
-    folder = tmp_path_factory.mktemp("depth")
-    sequence = jointed_toy(2, seed=2, scanner=DepthScanner(num_points=800, num_holes=0), step=math.radians(20))
-    view = sequence.view
+def test_depth_images_are_registered_and_what_was_seen_is_drawn(run, error_of, toy, tmp_path, monkeypatch):
+    view = toy.view
     center = (-view.corner / view.pitch - 0.5).tolist()
-    camera = Camera(view.width, view.height, [1 / view.pitch, 1 / view.pitch, *center])
+    camera = tr.Camera(view.width, view.height, [1 / view.pitch, 1 / view.pitch, *center])
     for frame in range(2):
-        depth = rasterize(sequence.mesh(frame), view, cull_back=True).depth
-        save_depth(folder / f"{frame}.png", depth.where(depth.isfinite(), 0.0), 2e-4)
-    save_depth_camera(folder / "k.json", camera, 2e-4)
-    return folder
-
-
-def test_depth_images_are_registered_and_what_was_seen_is_drawn(run, error_of, depth_images, tmp_path, monkeypatch):
-    folder = depth_images
-
-    def still(source, target, bones, grid, **given):
-        return register(source, target, bones, grid, start=source.points, **given)
-
-    register = pipeline.register
-    monkeypatch.setattr(pipeline, "register", still)
-    pair = ("register", "--depth", folder / "0.png", folder / "1.png")
-    options = ("--intrinsics", folder / "k.json", "-o", tmp_path / "out.glb", "--bones", 4, "--grid", 20)
+        depth, _ = depth_of(toy.mesh(frame), view)
+        save_depth(tmp_path / f"{frame}.png", depth, 2e-4)
+    save_cameras(tmp_path / "k.json", camera, depth_scale=2e-4)
+    original = pipeline.register
+    monkeypatch.setattr(
+        pipeline, "register", lambda first, *others, **given: original(first, *others, start=first.points, **given)
+    )
+    pair = ("register", "--depth", tmp_path / "0.png", tmp_path / "1.png")
+    options = ("--intrinsics", tmp_path / "k.json", "-o", tmp_path / "out.glb", "--bones", 4, "--grid", 20)
     answer = run(*pair, *options)
     assert answer.exit_code in (0, 1), answer.output
     found = tr.load(tmp_path / "out.safetensors")
     assert len(found.points) > 300
     names = sorted(path.name for path in (tmp_path / "out_seen").iterdir())
     assert names == ["registered.png", "source.png", "target.png"]
-    source = load_image(tmp_path / "out_seen" / "source.png")
-    camera, _ = load_depth_camera(folder / "k.json")
+    with Image.open(tmp_path / "out_seen" / "source.png") as file:
+        source = torch.from_numpy(np.asarray(file) / 255.0)
     assert source.shape == (camera.height, camera.width, 3)
-    colored = (source.amax(-1) > 0) & ~((source - torch.tensor([1.0, 0.25, 0.15])).abs() < 0.01).all(-1)
-    assert int(colored.sum()) == len(found.points)
+    cut = ((source - torch.tensor([1.0, 0.25, 0.15])).abs() < 0.01).all(-1)
+    assert int(((source.amax(-1) > 0) & ~cut).sum()) == len(found.points)
     out = ("-o", tmp_path / "no.glb")
     assert "--depth takes --intrinsics" in error_of(*pair, *out)
     assert "no meaning without --depth" in error_of("register", "a.ply", "b.ply", "--smoothing", 0.001, *out)
-    far = ("--intrinsics", folder / "k.json", "--depth-range", 900, 901)
+    far = ("--intrinsics", tmp_path / "k.json", "--depth-range", 900, 901)
     assert "0.png: depth" in error_of(*pair, *far, *out, "--seen", tmp_path / "far")
 
 
-def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path, monkeypatch):
-    folder, _ = scans
-    three = ("register", folder / "source.ply", folder / "target.ply", folder / "bare.ply")
-    arm = KinematicTree((
-        Joint("base", -1, torch.eye(4)),
-        Joint("joint_1", 0, torch.eye(4), "revolute", (0.0, 0.0, 1.0), lower=-1.0, upper=1.0),
-    ))  # fmt: skip
-    robot = RobotModel(
-        arm, torch.zeros(4, dtype=torch.long), torch.tensor([[0.0], [0.25], [-0.5]]), torch.eye(4).repeat(3, 1, 1),
-        torch.tensor([0.0, 0.001, 0.002]), ("joint_1",),
+def test_scans_of_a_robot_become_its_description(run, error_of, registered, tmp_path, monkeypatch):
+    three = ("register", *(registered[0] / f"{name}.ply" for name in ("source", "target", "bare")))
+    kinds = [SimpleNamespace(name="joint_1", kind="revolute")]
+    robot = SimpleNamespace(
+        tree=type("Tree", (list,), {"joints": [None, *kinds]})([0, 1]), loose=("joint_1",),
+        joint_values=torch.tensor([[0.0], [0.25], [-0.5]]), residuals=torch.tensor([0.0, 0.001, 0.002]),
     )  # fmt: skip
     asked = []
 
@@ -166,7 +134,7 @@ def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path,
         asked.append((len(given), bones, grid))
         return Found()
 
-    monkeypatch.setattr(register_sequence, "register_sequence", known)
+    monkeypatch.setattr("torchreg.registration.register_sequence.register_sequence", known)
     answer = run(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
     assert answer.exit_code == 0, answer.output
     assert asked == [(3, 8, 25), tmp_path / "robot.safetensors", tmp_path / "robot.urdf"]
@@ -174,7 +142,52 @@ def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path,
     assert "joint_1 does not explain how its two links move" in answer.output
     lines = (tmp_path / "robot_joints.csv").read_text().splitlines()
     assert lines == ["scan,joint_1", "source.ply,0.0", "target.ply,0.25", "bare.ply,-0.5"]
-    assert "exists" in error_of(*three, "-o", tmp_path / "robot.urdf", "--urdf")
-    assert "more need --urdf" in error_of(*three, "-o", tmp_path / "many.glb")
-    assert "--weights has no meaning with --urdf" in error_of(*three, "--urdf", "--weights", tmp_path / "w.ply")
-    assert "--scale is given once" in error_of(*three, "--urdf", "-o", tmp_path / "a", "--scale", 1, "--scale", 2)
+    for options, message in [
+        (["-o", tmp_path / "robot.urdf", "--urdf"], "exists"),
+        (["-o", tmp_path / "many.glb"], "more need --urdf"),
+        (["--urdf", "--weights", tmp_path / "w.ply"], "--weights has no meaning with --urdf"),
+        (["--urdf", "--support", "keep"], "--support has no meaning with --urdf"),
+        (["--urdf", "-o", tmp_path / "a", "--scale", 1, "--scale", 2], "--scale is given once for all scans"),
+    ]:
+        assert message in error_of(*three, *options)
+    pair = *three[:3], "-o", tmp_path / "no.glb", "--scale", 1, "--scale", 1, "--scale", 1
+    assert "--scale is given once for both scans, or twice, got 3" in error_of(*pair)
+
+
+def _text(place, mark):
+    return mark.join(str(number) for number in place.tolist())
+
+
+def test_handles_come_to_their_targets(run, error_of, registered, tmp_path):
+    place, found, _ = registered
+    ends = [int(found.points[:, 1].argmin()), int(found.points[:, 1].argmax())]
+    targets = found.deformed[ends] + 0.01
+    options = []
+    for end, target in zip(ends, targets, strict=True):
+        options += ["--handle", _text(found.points[end], ","), "--to", _text(target, " ")]
+    answer = run("pose", place / "found", *options, "-o", tmp_path / "posed.ply")
+    assert answer.exit_code == 0, answer.output
+    assert "miss" in answer.output
+    posed = tr.load_points(tmp_path / "posed.ply").points
+    assert float((posed[ends] - targets).norm(dim=-1).max()) < 0.005
+    tr.PoseStarts(torch.zeros(1, 6), torch.zeros(1), torch.tensor(1.0)).save(tmp_path / "starts.safetensors")
+    one = ["--handle", "0,0,0", "--to", "0,0,0"]
+    for words, message in [
+        ([place / "found", *one, "--to", "0,0,1"], "equally often"),
+        ([place / "found", "--handle", "0,0", "--to", "0,0,up"], "three numbers"),
+        ([place / "found", *one, "-o", tmp_path / "no.obj"], "must end in"),
+        ([tmp_path / "starts", *one], "holds a PoseStarts"),
+    ]:
+        assert message in error_of("pose", "-o", tmp_path / "no.ply", *words)
+
+
+def test_without_handles_a_page_opens(run, error_of, registered, tmp_path, interrupted):
+    pytest.importorskip("viser", reason="the viewer needs viser")
+    place, found, _ = registered
+    interrupted("torchreg.cli.view.time.sleep")
+    tr.solve_pose(found.model, found.points[:1], found.deformed[:1] + 0.05).save(tmp_path / "start.safetensors")
+    page = "--no-browser", "--port", "0", "-o", tmp_path / "p.ply"
+    answer = run("pose", place / "found", "--start", tmp_path / "start", *page)
+    assert answer.exit_code == 0, answer.output
+    assert "http://127.0.0.1:" in answer.output
+    assert "a pose to start from" in error_of("pose", place / "found", "--start", place / "found", *page)

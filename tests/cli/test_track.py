@@ -2,6 +2,7 @@
 
 import json
 import re
+import zipfile
 from dataclasses import fields
 
 import numpy as np
@@ -9,23 +10,26 @@ import pytest
 import torch
 from PIL import Image
 
+import torchreg as tr
+import torchreg.shapes.skin as skin_module
 import torchreg.tracking.frame_fit as fit_module
-import torchreg.tracking.recovery as recovery_module
-import torchreg.tracking.tracker as track_module
-from torchreg.alignment.results import PoseStarts
+from experiments.made_up.pictures import PictureStyle, stereo_cameras
+from experiments.made_up.videos import shape_video
+from tests.cli.conftest import save_cameras, save_picture
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
-from torchreg.io.frames import save_frames
-from torchreg.io.points import load_points, save_points
-from torchreg.result import Status
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.hand import Hand
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
-from torchreg.storage import load
-from torchreg.tracking.tracker import TrackConfig, Tracker
+from torchreg.io.points import save_points
 
 FRAMES = 6
 FAST = ("--movie", "none", "--no-gltf")
+
+
+def stacked(clouds, spare=0):
+    """Return the arrays of an .npz of frames, with rows of NaN before each."""
+    points = np.full((len(clouds), spare + max(map(len, clouds)), 3), np.nan, dtype=np.float32)
+    for rows, cloud in zip(points, clouds, strict=True):
+        rows[spare : spare + len(cloud)] = cloud
+    return {"points": points, "counts": [spare + len(cloud) for cloud in clouds]}
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +38,10 @@ def sequence(plain_hand, plain_hand_surface, tmp_path_factory):
     place = tmp_path_factory.mktemp("sequence")
     poses = hand_motion(plain_hand, "bending_palm", FRAMES, seed=1)
     clouds = range_clouds(plain_hand, poses, num_points=400, camera=torch.zeros(3), skin=plain_hand_surface)
-    save_frames(place / "frames", [cloud.points for cloud in clouds])
-    save_frames(place / "frames.npz", [cloud.points for cloud in clouds])
+    (place / "frames").mkdir()
+    for number, cloud in enumerate(clouds):
+        save_points(place / "frames" / f"frame_{number:04d}.ply", cloud.points)
+    np.savez(place / "frames.npz", **stacked([cloud.points for cloud in clouds]))
     (place / "start.json").write_text(json.dumps(poses[0].tolist()), encoding="utf-8")
     return place
 
@@ -55,11 +61,11 @@ def sampled_once():
     known = {}
 
     def sampled(shape, count, **options):
-        if not isinstance(shape, Hand) or shape.side != "right":
-            return sample_skin(shape, count, **options)
+        if not isinstance(shape, tr.Hand) or shape.side != "right":
+            return skin_module.sample_skin(shape, count, **options)
         key = (count, *options.items())
-        first = known[key] = known.get(key) or sample_skin(shape, count, **options)
-        return LinearBlendSkin(shape, first.points, first.weights, first.reference_pose, normals=first.normals)
+        first = known[key] = known.get(key) or skin_module.sample_skin(shape, count, **options)
+        return tr.LinearBlendSkin(shape, first.points, first.weights, first.reference_pose, normals=first.normals)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "sample_skin", sampled)
@@ -69,9 +75,9 @@ def sampled_once():
 @pytest.fixture(scope="module")
 def whole(sequence, plain_hand, sampled_once):
     """What the library makes of the sequence."""
-    frames = [load_points(path).points for path in sorted((sequence / "frames").iterdir())]
+    frames = [tr.load_points(path).points for path in sorted((sequence / "frames").iterdir())]
     start = torch.tensor(json.loads((sequence / "start.json").read_text(encoding="utf-8")))
-    return Tracker(plain_hand, start).run(frames, times=[k / 20 for k in range(FRAMES)])
+    return tr.Tracker(plain_hand, start).run(frames, times=[k / 20 for k in range(FRAMES)])
 
 
 def same(first, second):
@@ -91,22 +97,22 @@ def test_what_cannot_be_drawn_or_written_loses_no_result_and_is_told_once(run, c
     )
     answer = run(*command("--pictures", tmp_path / "live", "--bvh", tmp_path / "r.bvh", "--quiet"))
     assert answer.exit_code == 1
-    told = [line.split("/")[-1] for line in answer.output.splitlines()]
+    told = [line.split("/")[-1] for line in answer.output.splitlines() if "is not written" in line]
     assert [line.split(" is not written: ")[0] for line in told] == ["torchreg: warning: --pictures", "r.gif", "r.bvh"]
-    assert same(load(tmp_path / "r.safetensors"), whole)
+    assert same(tr.load(tmp_path / "r.safetensors"), whole)
     assert (tmp_path / "r.glb").exists()
 
 
 def stop_at(monkeypatch, frame, error=KeyboardInterrupt):
     """Let the tracker be stopped while it works on a frame."""
-    step = Tracker.step
+    step = tr.Tracker.step
 
     def stopped(self, points, time=None, **told):
         if self.state.frame == frame:
             raise error
         return step(self, points, time, **told)
 
-    monkeypatch.setattr(Tracker, "step", stopped)
+    monkeypatch.setattr(tr.Tracker, "step", stopped)
 
 
 def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command, whole, tmp_path):
@@ -115,14 +121,14 @@ def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command,
     assert f"{FRAMES} frames: {FRAMES} tracked; " in answer.output
     names = ["live", "r.bvh", "r.gif", "r.glb", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
-    result = load(tmp_path / "r.safetensors")
+    result = tr.load(tmp_path / "r.safetensors")
     assert same(result, whole)
     assert result.times.tolist() == [k / 20 for k in range(FRAMES)]
     assert sorted(path.name for path in (tmp_path / "live").iterdir()) == [f"frame_000{k}.png" for k in range(FRAMES)]
     assert f"Frames: {FRAMES}\nFrame Time: 0.05\n" in (tmp_path / "r.bvh").read_text(encoding="utf-8")
     with Image.open(tmp_path / "r.gif") as file:
         assert (file.n_frames, file.info["duration"]) == (FRAMES, 50)
-    assert ArticulatedShape.from_gltf(tmp_path / "r.glb").part_names[0] == "palm"
+    assert tr.ArticulatedShape.from_gltf(tmp_path / "r.glb").part_names[0] == "palm"
 
 
 def test_archives_and_lists_of_files_are_sequences_too(run, command, whole, tmp_path):
@@ -130,7 +136,7 @@ def test_archives_and_lists_of_files_are_sequences_too(run, command, whole, tmp_
     for frames in (["frames.npz"], listed):
         answer = run(*command("--force", "--quiet", *FAST, frames=frames))
         assert (answer.exit_code, answer.output) == (0, "")
-        assert torch.allclose(load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-5)
+        assert torch.allclose(tr.load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-5)
 
 
 @pytest.mark.parametrize("frame", [1, 4, 5])
@@ -140,17 +146,17 @@ def test_an_interrupted_run_goes_on_to_the_same_end(run, command, whole, tmp_pat
         answer = run(*command("--save-every", 2, *FAST))
     assert answer.exit_code == 130
     assert f"interrupted; {frame} of {FRAMES} frames are done; --resume goes on from there" in answer.output
-    part = load(tmp_path / "r.safetensors")
+    part = tr.load(tmp_path / "r.safetensors")
     assert len(part.statuses) == len(part.poses) == frame
     done = []
-    step = Tracker.step
+    step = tr.Tracker.step
     monkeypatch.setattr(
-        Tracker, "step", lambda self, points, time, **told: done.append(time) or step(self, points, time, **told)
+        tr.Tracker, "step", lambda self, points, time, **told: done.append(time) or step(self, points, time, **told)
     )
     answer = run(*command("--save-every", 2, "--resume", *FAST))
     assert answer.exit_code == 0, answer.output
     assert len(done) == FRAMES - frame
-    assert same(load(tmp_path / "r.safetensors"), whole)
+    assert same(tr.load(tmp_path / "r.safetensors"), whole)
 
 
 def test_a_killed_run_goes_on_from_what_was_saved_last(run, command, whole, tmp_path, monkeypatch):
@@ -159,26 +165,25 @@ def test_a_killed_run_goes_on_from_what_was_saved_last(run, command, whole, tmp_
         assert isinstance(run(*command("--save-every", 2, *FAST)).exception, MemoryError)
     assert [path.name for path in tmp_path.iterdir()] == ["r.progress"]
     assert run(*command("--resume", *FAST)).exit_code == 0
-    assert same(load(tmp_path / "r.safetensors"), whole)
+    assert same(tr.load(tmp_path / "r.safetensors"), whole)
 
 
 def test_an_interruption_while_a_frame_is_drawn_leaves_no_hole(run, command, whole, tmp_path, monkeypatch):
-    from torchreg.viz.tracking import FrameOverlays
+    def draws(stops=False):
+        def save(self, path, data, result):
+            if stops and result.frame == 3:
+                raise KeyboardInterrupt
+            path.touch()
 
-    save = FrameOverlays.save
+        return save
 
-    def interrupted(self, path, data, result):
-        if result.frame == 3:
-            raise KeyboardInterrupt
-        return save(self, path, data, result)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(FrameOverlays, "save", interrupted)
-        answer = run(*command("--pictures", tmp_path / "live", *FAST))
+    monkeypatch.setattr("torchreg.viz.tracking.FrameOverlays.save", draws(stops=True))
+    answer = run(*command("--pictures", tmp_path / "live", *FAST))
     assert "3 of 6 frames are done" in answer.output
+    monkeypatch.setattr("torchreg.viz.tracking.FrameOverlays.save", draws())
     assert run(*command("--pictures", tmp_path / "live", "--resume", *FAST)).exit_code == 0
     assert len(list((tmp_path / "live").iterdir())) == FRAMES
-    assert same(load(tmp_path / "r.safetensors"), whole)
+    assert same(tr.load(tmp_path / "r.safetensors"), whole)
 
 
 def test_an_interruption_before_the_first_frame_leaves_nothing(run, command, tmp_path, monkeypatch):
@@ -192,7 +197,7 @@ def test_frames_that_came_later_are_added(run, command, whole, tmp_path, monkeyp
     every = [*some, *(f"frames/frame_000{k}.ply" for k in (4, 5))]
     assert run(*command("--resume", *FAST, frames=some)).exit_code == 0
     assert run(*command("--resume", *FAST, frames=every)).exit_code == 0
-    assert same(load(tmp_path / "r.safetensors"), whole)
+    assert same(tr.load(tmp_path / "r.safetensors"), whole)
     stop_at(monkeypatch, FRAMES)
     # There is nothing left to do but to write.
     assert run(*command("--resume", "--movie", "none", frames=every)).exit_code == 0
@@ -229,18 +234,14 @@ def test_frames_that_cannot_be_read_are_dropped(run, command, sequence, tmp_path
     assert "frame_0003.ply: no_data" in answer.output
     assert "frame_0004.ply: back (" in answer.output
     assert "6 frames: 5 tracked, 1 no_data" in answer.output
-    result = load(tmp_path / "r.safetensors")
+    result = tr.load(tmp_path / "r.safetensors")
     assert [status.usable for status in result.statuses] == [True, True, True, False, True, True]
     assert result.poses.shape == (FRAMES, 27)
 
 
 def test_points_that_are_not_finite_are_left_out_or_drop_the_frame(run, command, sequence, tmp_path):
-    frames = [load_points(path).points for path in sorted((sequence / "frames").iterdir())][:2]
-    stack = np.full((2, 1 + max(map(len, frames)), 3), np.nan, dtype=np.float32)
-    counts = [len(frame) + 1 for frame in frames]
-    for rows, frame in zip(stack, frames, strict=True):
-        rows[1 : 1 + len(frame)] = frame
-    np.savez(tmp_path / "f.npz", points=stack, counts=counts)
+    frames = [tr.load_points(path).points for path in sorted((sequence / "frames").iterdir())][:2]
+    np.savez(tmp_path / "f.npz", **stacked(frames, spare=1))
     assert run(*command(*FAST, "--quiet", frames=[tmp_path / "f.npz"])).exit_code == 0
     answer = run(*command(*FAST, "--quiet", "--force", "--nan-policy", "raise", frames=[tmp_path / "f.npz"]))
     assert answer.exit_code == 1
@@ -251,39 +252,26 @@ def test_points_that_are_not_finite_are_left_out_or_drop_the_frame(run, command,
 def test_millimeters_taken_for_meters_are_warned_of_once(run, command, sequence, whole, tmp_path):
     (tmp_path / "mm").mkdir()
     for path in (sequence / "frames").iterdir():
-        save_points(tmp_path / "mm" / path.name, 1000 * load_points(path).points)
+        save_points(tmp_path / "mm" / path.name, 1000 * tr.load_points(path).points)
     answer = run(*command(*FAST, frames=[tmp_path / "mm"]))
     assert answer.exit_code == 1
     assert answer.output.count("torchreg: warning: the data spread over") == 1
     assert "6 frames: 0 tracked, 6 other_units" in answer.output
-    assert load(tmp_path / "r.safetensors").statuses == (Status.OTHER_UNITS,) * FRAMES
+    assert tr.load(tmp_path / "r.safetensors").statuses == (tr.Status.OTHER_UNITS,) * FRAMES
     assert run(*command(*FAST, "--force", "--scale", "0.001", frames=[tmp_path / "mm"])).exit_code == 0
-    assert torch.allclose(load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-3)
+    assert torch.allclose(tr.load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-3)
 
 
-def test_options_reach_the_tracker(run, command, monkeypatch):
-    seen = []
-
-    def noted(shape, initial_pose=None, *, config=None, locked=(), initializer=None, fit_shape=False):
-        seen.append((initial_pose, config, locked, fit_shape))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(track_module, "Tracker", noted)
+def test_options_reach_the_tracker(run, command, interrupted):
+    given = interrupted("torchreg.tracking.tracker.Tracker")
     options = ("--prediction", "none", "--points", 300, "--model-points", "data", "--recovery", "starts", "--seed", 4,
                "--locked", "base", "--upright", "--up", "-z")  # fmt: skip
     run(*command(*options))
-    ((pose, config, locked, fit_shape),) = seen
-    assert not fit_shape
-    assert locked == ("base",)
-    assert config == TrackConfig(
-        prediction="none",
-        num_model_points=300,
-        model_points="data",
-        recovery="starts",
-        seed=4,
-        upright=(0, 0, -1),
+    (((_, pose), known),) = given
+    assert (known["fit_shape"], known["locked"], pose.shape) == (False, ("base",), (27,))
+    assert known["config"] == tr.TrackConfig(
+        prediction="none", num_model_points=300, model_points="data", recovery="starts", seed=4, upright=(0, 0, -1)
     )
-    assert pose.shape == (27,)
 
 
 def test_without_a_start_the_shape_is_searched_for(run, sequence, tmp_path, monkeypatch):
@@ -292,14 +280,14 @@ def test_without_a_start_the_shape_is_searched_for(run, sequence, tmp_path, monk
 
     def found(shape, data, **options):
         asked.append(len(data))
-        return PoseStarts(start[None], torch.zeros(1), torch.ones(()))
+        return tr.PoseStarts(start[None], torch.zeros(1), torch.ones(()))
 
-    monkeypatch.setattr(recovery_module, "find_pose", found)
+    monkeypatch.setattr("torchreg.tracking.recovery.find_pose", found)
     answer = run("track", "hand", sequence / "frames", "-o", tmp_path / "r", *FAST)
     assert answer.exit_code == 0, answer.output
     # What was found everywhere is checked by the same search in one more frame.
     assert len(asked) == 2
-    assert load(tmp_path / "r.safetensors").acquired[0] == "found"
+    assert tr.load(tmp_path / "r.safetensors").acquired[0] == "found"
 
 
 def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
@@ -311,19 +299,19 @@ def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
     assert "1 frame: 0 tracked, 1 lost" in answer.output
     names = ["live", "r.gif", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
-    assert not load(tmp_path / "r.safetensors").poses.isfinite().any()
+    assert not tr.load(tmp_path / "r.safetensors").poses.isfinite().any()
     assert (tmp_path / "live" / "frame_0000.png").exists()
 
 
 def test_a_robot_is_tracked(run, folder, tmp_path):
-    pose = ArticulatedShape.from_urdf(folder / "arm.urdf", free_base=False).rest_pose()
+    pose = tr.ArticulatedShape.from_urdf(folder / "arm.urdf", free_base=False).rest_pose()
     (tmp_path / "start.json").write_text(json.dumps(pose.tolist()), encoding="utf-8")
     answer = run(
         "track", folder / "arm.urdf", folder / "arm.npz", "-o", tmp_path / "r", "--start", tmp_path / "start.json",
         *FAST,
     )  # fmt: skip
     assert answer.exit_code == 0, answer.output
-    assert abs(load(tmp_path / "r.safetensors").poses[0, 0].item() - 0.02) < 0.005
+    assert abs(tr.load(tmp_path / "r.safetensors").poses[0, 0].item() - 0.02) < 0.005
 
 
 def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
@@ -332,7 +320,7 @@ def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
     (tmp_path / "joints.csv").write_text("shoulder\n0.25\n")
     known = "--locked", "base", "--joints", tmp_path / "joints.csv", "--joint-std", "0.001deg"
     answer = run(*arm, "-o", tmp_path / "r", "--start", tmp_path / "start.json", *known)
-    poses = load(tmp_path / "r.safetensors").poses
+    poses = tr.load(tmp_path / "r.safetensors").poses
     torch.testing.assert_close(poses[:, :6], torch.tensor([0.02] + [0.0] * 5).expand(len(poses), -1), atol=1e-6, rtol=0)
     torch.testing.assert_close(poses[:, 6], torch.full_like(poses[:, 6], 0.25), atol=1e-3, rtol=0)
     assert answer.exit_code in (0, 1)
@@ -340,23 +328,32 @@ def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
     assert "beyond its limits" in error_of(*arm, "-o", tmp_path / "s", *known)
 
 
-def test_errors_are_one_line(error_of, command, sequence, tmp_path):
-    for arguments, message in [
-        (command(frames=["none.ply"]), "none.ply: No such file or directory"),
-        (command(frames=["start.json"]), "has the unknown ending '.json'"),
-        (command("--start", tmp_path / "none.json"), "none.json: No such file or directory"),
-        (command("--movie", "avi"), "--movie must be one of gif, mp4, none; got 'avi'"),
-        (command("--fps", 0), "--fps must be positive"),
-        (command("--scale", -1), "--scale must be positive"),
-        (command("--prediction", "maybe"), "prediction must be one of velocity, none"),
-        (command("--model-points", "few"), "model_points must be one of seen, data, shape"),
-        (command("--nan-policy", "keep"), "nan_policy must be one of raise, omit"),
-        (command("--points", 0), "num_model_points must be at least 1"),
-        (command("--fixed-base"), "--free-base/--fixed-base has no meaning for hand"),
-        (command(out="no/r"), "no does not exist; create it first"),
-        (command("--pictures", tmp_path / "no" / "live"), "live: No such file or directory"),
-    ]:
-        assert message in error_of(*arguments), arguments
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": ["none.ply"]}, "none.ply: No such file or directory"),
+        ({"frames": ["start.json"]}, "has the unknown ending '.json'"),
+        (("--start", "none.json"), "none.json: No such file or directory"),
+        (("--movie", "avi"), "--movie must be one of gif, mp4, none; got 'avi'"),
+        (("--fps", 0), "--fps must be positive"),
+        (("--scale", -1), "--scale must be positive"),
+        (("--prediction", "maybe"), "prediction must be one of velocity, none"),
+        (("--model-points", "few"), "model_points must be one of seen, data, shape"),
+        (("--nan-policy", "keep"), "nan_policy must be one of raise, omit"),
+        (("--points", 0), "num_model_points must be at least 1"),
+        (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand"),
+        (("--gltf", "a.glb", "--no-gltf"), "--gltf and --no-gltf cannot be used together"),
+        (("--poses", "a.txt"), "a.txt must end in .csv"),
+        (("--reach", 0.1), "--reach has no meaning without --stereo"),
+        (("--depth-range", 1, 2), "--depth-range has no meaning without --stereo or --depth"),
+        (("--depth",), "--depth takes --intrinsics FILE with the camera"),
+        ({"out": "no/r"}, "no does not exist; create it first"),
+        (("--pictures", "no/live"), "live: No such file or directory"),
+    ],
+)
+def test_errors_are_one_line(error_of, command, tmp_path, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in error_of(*(command(**options) if isinstance(options, dict) else command(*options)))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -369,11 +366,10 @@ def test_shapes_with_as_many_joints_are_told_apart(run, error_of, command, seque
     assert run(*command(*FAST, frames=["frames/frame_0000.ply"])).exit_code == 0
     other = ["hand-left" if argument == "hand" else argument for argument in command("--resume", *FAST)]
     assert "was written by another command: shape differ" in error_of(*other)
-    assert Hand("left").num_dofs == Hand().num_dofs
 
 
 def test_the_bones_of_a_rig_are_fitted_over_the_frames(folder, run, error_of, tmp_path):
-    vertices = load_points(folder / "flat.glb").points
+    vertices = tr.load_points(folder / "flat.glb").points
     for number in range(2):
         save_points(tmp_path / f"frame{number}.ply", 1.1 * vertices + torch.tensor([0.01 * number, 0.0, 0.0]))
     (tmp_path / "start.json").write_text("{}", encoding="utf-8")
@@ -385,7 +381,135 @@ def test_the_bones_of_a_rig_are_fitted_over_the_frames(folder, run, error_of, tm
     assert answer.exit_code in (0, 1), answer.output
     # An open cone slides along itself as it grows: what its size is, it does not tell.
     assert re.search(r"; size -?0\.\d\d \+- 0\.\d\d, girth ", answer.output)
-    found = load(tmp_path / "r.safetensors")
+    found = tr.load(tmp_path / "r.safetensors")
     assert found.coefficients.shape == (2 + 2 * 3,)
     assert float(found.residuals[-1]) < 0.003
     assert "fit_shape goes without" in error_of(*common, "--force", "--locked", "base")
+
+
+@pytest.mark.parametrize(
+    ("member", "content", "message"),
+    [
+        ("job.json", b"{", "is no progress of a tracker"),
+        ("job.json", b"[]", "must hold a TrackResult, a TrackState and what was to be done"),
+        ("job.json", None, "no item named 'job.json'"),
+        ("state.json", b"{}", "does not describe tensors"),
+        ("state.safetensors", b"", "is damaged"),
+        ("result.safetensors", None, "no item named 'result.safetensors'"),
+    ],
+)
+def test_damaged_progress_is_refused(run, error_of, command, tmp_path, member, content, message):
+    one = command("--resume", *FAST, frames=["frames/frame_0000.ply"])
+    assert run(*one).exit_code == 0
+    with zipfile.ZipFile(tmp_path / "r.progress") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members[member] = content
+    with zipfile.ZipFile(tmp_path / "r.progress", "w") as archive:
+        for name, held in members.items():
+            if held is not None:
+                archive.writestr(name, held)
+    assert message in error_of(*one)
+
+
+def test_frames_that_changed_since_and_states_of_other_results_are_refused(run, error_of, command, sequence, tmp_path):
+    (tmp_path / "mine").mkdir()
+    paths = [tmp_path / "mine" / f"{number}.ply" for number in range(2)]
+    for number, path in enumerate(paths):
+        path.write_bytes((sequence / "frames" / f"frame_000{number}.ply").read_bytes())
+    own = command("--resume", *FAST, frames=paths)
+    assert run(*own).exit_code == 0
+    kept, progress = paths[1].read_bytes(), (tmp_path / "r.progress").read_bytes()
+    save_points(paths[1], torch.rand(200, 3, generator=torch.Generator().manual_seed(0)))
+    message = error_of(*own)
+    assert f"{paths[1]} changed since" in message
+    assert "--force without --resume" in message
+    paths[1].write_bytes(kept)
+    assert not list(tmp_path.glob(".*.lock"))
+    assert run(*command("--force", *FAST, frames=paths[:1])).exit_code == 0
+    with zipfile.ZipFile(tmp_path / "r.progress") as archive:
+        short = {name: archive.read(name) for name in archive.namelist()}
+    (tmp_path / "r.progress").write_bytes(progress)
+    with zipfile.ZipFile(tmp_path / "r.progress") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members |= {name: short[name] for name in ("result.safetensors", "result.json")}
+    with zipfile.ZipFile(tmp_path / "r.progress", "w") as archive:
+        for name, held in members.items():
+            archive.writestr(name, held)
+    assert "has the state after 2 frames beside 1 results" in error_of(*own)
+
+
+def test_every_frame_is_shown_while_it_is_tracked(run, command, sequence, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="the viewer needs viser")
+    shown = []
+    monkeypatch.setattr(
+        "torchreg.viz.live_track.LiveTrack.show",
+        lambda self, points, frame: shown.append((len(points), frame.frame)),
+    )
+    frames = ["frames/frame_0000.ply", "frames/frame_0001.ply"]
+    answer = run(*command(*FAST, "--view", "--port", "0", "--no-browser", frames=frames))
+    assert answer.exit_code == 0, answer.output
+    assert "http://127.0.0.1:" in answer.output
+    assert shown == [(len(tr.load_points(sequence / name)), number) for number, name in enumerate(frames)]
+
+
+@pytest.fixture(scope="module")
+def pair(plain_hand, plain_hand_surface, tmp_path_factory):
+    """Folders left/ and right/ with pictures of a hand, calib.json, and the true poses."""
+    place = tmp_path_factory.mktemp("stereo")
+    cameras = stereo_cameras(width=320, height=240, focal=400.0)
+    poses = hand_motion(plain_hand, "rotation", 2, distance=0.6)
+    style = PictureStyle(wall=0.95, supersampling=1)
+    for name in ("left", "right"):
+        (place / name).mkdir()
+    for number, frame in enumerate(shape_video(plain_hand, poses, cameras, skin=plain_hand_surface, style=style)):
+        for name, picture in zip(("left", "right"), frame, strict=True):
+            save_picture(place / name / f"{number}.png", picture.image)
+    save_cameras(place / "calib.json", cameras.left, cameras.right)
+    save_cameras(place / "one.json", cameras.left)
+    save_cameras(place / "swapped.json", cameras.right, cameras.left)
+    (place / "start.json").write_text(json.dumps(poses[0].tolist()), encoding="utf-8")
+    return place, poses
+
+
+@pytest.fixture
+def stereo(pair, tmp_path):
+    """Return the arguments that track pictures, with other options after them."""
+    place, _ = pair
+    return lambda *options, sides=("left", "right"), calibration="calib.json": (
+        "track", "hand", "--stereo", *(place / side for side in sides), "--calibration", place / calibration,
+        "--depth-range", 0.45, 0.8, "--start", place / "start.json", "-o", tmp_path / "r", "--matcher", "block", *FAST,
+        *options,
+    )  # fmt: skip
+
+
+def test_pictures_are_tracked_and_what_was_seen_is_drawn(run, error_of, stereo, pair, plain_hand, tmp_path):
+    answer = run(*stereo())
+    assert answer.exit_code == 0, answer.output
+    assert "2 frames: 2 tracked" in answer.output
+    result = tr.load(tmp_path / "r.safetensors")
+    assert (result.keypoints - plain_hand.keypoints(pair[1])).norm(dim=-1).mean() < 5e-3
+    names = sorted(path.name for path in (tmp_path / "r_seen").iterdir())
+    assert names == [f"{kind}_000{k}.png" for kind in ("disparity", "frame") for k in range(2)]
+    with Image.open(tmp_path / "r_seen" / "frame_0000.png") as file:
+        drawn = torch.from_numpy(np.asarray(file) / 255.0)
+    assert drawn.shape == (240, 320, 3)
+    for color in ([0.2, 1.0, 0.3], [0.1, 0.65, 1.0]):
+        assert ((drawn - torch.tensor(color)).abs() < 0.01).all(-1).sum() > 100
+    for option in (("--reach", 0.15), ("--volume", -1, -1, 0, 0, 1, 1)):
+        assert f"{option[0]} differ" in error_of(*stereo("--resume", *option))
+
+
+def test_wrong_pictures_are_refused(error_of, stereo, pair, tmp_path):
+    left, right = (pair[0] / name for name in ("left", "right"))
+    for command, message in [
+        (stereo(sides=("left",)), "takes two folders as FRAMES"),
+        (stereo(sides=("right", "left")), "left and right pictures are swapped"),
+        (("track", "hand", "--stereo", left, right), "--stereo takes --calibration"),
+        (stereo(calibration="one.json"), "must hold the left and the right camera"),
+        (stereo(calibration="swapped.json"), "left and right are swapped"),
+    ]:
+        assert message in error_of(*command)
+    (tmp_path / "r_seen").mkdir()
+    (tmp_path / "r_seen" / "old.png").touch()
+    assert "holds pictures; pass --force" in error_of(*stereo())
+    assert "must be a folder, it is a file" in error_of(*stereo("--seen", pair[0] / "one.json"))

@@ -3,11 +3,8 @@
 import pytest
 import torch
 
-from torchreg.alignment.results import PoseStarts
-from torchreg.cli import view as module
+import torchreg as tr
 from torchreg.io.points import save_points
-from torchreg.shapes.hand import Hand
-from torchreg.storage import save_result
 
 pytest.importorskip("viser", reason="the viewer needs viser")
 
@@ -15,10 +12,10 @@ pytest.importorskip("viser", reason="the viewer needs viser")
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     place = tmp_path_factory.mktemp("view")
-    rest = Hand().rest_pose()
-    starts = PoseStarts(torch.stack([rest, rest]), torch.zeros(2), torch.tensor(1.0))
-    save_result(starts, place / "starts.safetensors")
-    save_points(place / "cloud.ply", Hand().keypoints(rest))
+    rest = tr.Hand().rest_pose()
+    starts = tr.PoseStarts(torch.stack([rest, rest]), torch.zeros(2), torch.tensor(1.0))
+    starts.save(place / "starts.safetensors")
+    save_points(place / "cloud.ply", tr.Hand().keypoints(rest))
     save_points(place / "mesh.ply", torch.eye(3), faces=torch.tensor([[0, 1, 2]]))
     return place
 
@@ -32,32 +29,29 @@ def test_a_result_becomes_one_file(run, result, tmp_path):
     assert (tmp_path / "a.html").stat().st_size > 100_000
 
 
-def test_a_result_is_served_until_interrupted(run, result, monkeypatch):
+def test_a_result_is_served_until_interrupted(run, result, monkeypatch, interrupted):
     opened = []
-
-    def interrupted(seconds):
-        raise KeyboardInterrupt
-
     monkeypatch.setattr("webbrowser.open", opened.append)
-    monkeypatch.setattr(module.time, "sleep", interrupted)
+    interrupted("torchreg.cli.view.time.sleep")
     answer = run("view", result / "starts", "--shape", "hand", "--port", "0", "--up", "-y")
     assert answer.exit_code == 0, answer.output
     assert opened[0] in answer.output
     assert opened[0].startswith("http://127.0.0.1:")
 
 
-def test_data_are_read_as_they_are(result):
-    points, mesh = module._read([result / "cloud.ply", result / "mesh.ply"])
-    assert points.shape == (21, 3)
-    assert mesh.num_faces == 1
-
-
-def test_what_does_not_fit_is_refused(error_of, result, tmp_path):
-    assert "shape must be given" in error_of("view", result / "starts", "--html", tmp_path / "a.html")
-    assert "--up must be one of" in error_of("view", result / "starts", "--up", "w")
-    assert "must end in" in error_of("view", result / "starts", "--html", tmp_path / "a.txt")
-    assert "about a --shape" in error_of("view", result / "starts", "--fixed-base")
-    assert "nowhere" in error_of("view", result / "nowhere", "--shape", "hand")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["starts", "--html", "a.html"], "shape must be given"),
+        (["starts", "--up", "w"], "--up must be one of"),
+        (["starts", "--html", "a.txt"], "must end in"),
+        (["starts", "--fixed-base"], "about a --shape"),
+        (["nowhere", "--shape", "hand"], "nowhere"),
+    ],
+)
+def test_what_does_not_fit_is_refused(error_of, result, tmp_path, words, message):
+    given = [tmp_path / word if "." in word else word for word in words[1:]]
+    assert message in error_of("view", result / words[0], *given)
 
 
 def test_shapes_and_scans_are_viewed_too(run, error_of, result, folder, tmp_path):
@@ -76,7 +70,7 @@ def test_shapes_and_scans_are_viewed_too(run, error_of, result, folder, tmp_path
 
 
 def test_results_are_shown_with_the_shape_that_they_keep(run, result, tmp_path):
-    rest = Hand().rest_pose()
-    PoseStarts(rest[None], torch.zeros(1), torch.tensor(1.0), Hand()).save(tmp_path / "s.safetensors")
+    rest = tr.Hand().rest_pose()
+    tr.PoseStarts(rest[None], torch.zeros(1), torch.tensor(1.0), tr.Hand()).save(tmp_path / "s.safetensors")
     answer = run("view", tmp_path / "s", "--html", tmp_path / "s.html")
     assert answer.exit_code == 0, answer.output

@@ -35,6 +35,23 @@ Scale = Annotated[
     float, typer.Option(help="Metres per unit of the files (clouds, meshes, calibrations); 0.001 for millimeters.")
 ]
 
+FitShape = Annotated[
+    bool,
+    typer.Option(
+        "--fit-shape",
+        help="Also fit the shape's coefficients, as of a body to a person; of a rig without any the lengths and radii "
+        "of its parts.",
+    ),
+]
+Support = Annotated[
+    str, typer.Option(help="A table or a floor that the scanned thing stands on: auto leaves it out, keep keeps it.")
+]
+
+
+def fitted_shape(shape: ArticulatedShape, wanted: bool) -> ArticulatedShape:
+    """Return a shape whose coefficients can be fitted, where that is wanted."""
+    return shape.with_bone_coefficients() if wanted and not shape.coefficient_names else shape
+
 
 def read_schedule(text: str | None) -> SigmaSchedule | None:
     """Return the schedule that START:STOP:STEPS describes, None for None."""
@@ -79,21 +96,6 @@ def cloud_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
-    """Write a pose (num_dofs,) by name of degree of freedom, as JSON or as a table of one row (.csv)."""
-    import json
-
-    from torchreg.io.atomic import write_atomic
-
-    if path.suffix.lower() == ".csv":
-        from torchreg.io.pose_table import save_pose_table
-
-        save_pose_table(path, shape.dof_names, [pose.tolist()])
-        return
-    named = dict(zip(shape.dof_names, pose.tolist(), strict=True))
-    write_atomic(path, (json.dumps(named, indent=2) + "\n").encode())
-
-
 def alignment_summary(result: AlignResult) -> str:
     """Return status, confidence, what is doubtful, inliers, residual and cost of an alignment in one line."""
     near = result.distances[result.inliers]
@@ -104,16 +106,12 @@ def alignment_summary(result: AlignResult) -> str:
     return f"{result.statuses[0].value}{sure}, {counts}, {rms}cost {float(result.cost):.4g}{doubt}"
 
 
-# Coefficients told in a line of a terminal: anny's, and the size and girth of a rig with some of its parts.
-_TOLD = 6
-
-
 def person_summary(shape: ArticulatedShape, result: AlignResult | TrackResult) -> str:
-    """Return the coefficients that were fitted, with their standard deviations; nothing where none were."""
+    """Return the first coefficients that were fitted, with their standard deviations; nothing where none were."""
     if result.coefficients is None or result.coefficient_covariance is None:
         return ""
     rows = zip(
         shape.coefficient_names, result.coefficients.tolist(),
         result.coefficient_covariance.diagonal().sqrt().tolist(), strict=True,
     )  # fmt: skip
-    return ", ".join(f"{name} {value:.2f} +- {std:.2f}" for name, value, std in list(rows)[:_TOLD])
+    return ", ".join(f"{name} {value:.2f} +- {std:.2f}" for name, value, std in list(rows)[:6])

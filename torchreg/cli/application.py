@@ -12,6 +12,7 @@ from torchreg import __version__
 from torchreg.cli.align import align
 from torchreg.cli.calibrate import calibrate
 from torchreg.cli.demo import demo
+from torchreg.cli.export import export
 from torchreg.cli.figure import figure
 from torchreg.cli.formats import formats
 from torchreg.cli.info import info
@@ -23,6 +24,7 @@ from torchreg.cli.spine import spine
 from torchreg.cli.track import track
 from torchreg.cli.train_initializer import train_initializer
 from torchreg.cli.view import view
+from torchreg.cli.writers import endings_help
 
 app = typer.Typer(
     name="torchreg",
@@ -66,6 +68,8 @@ _COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
     (calibrate, "Find a robot's base in a camera, or the size of a hand.",
      ("calibrate robot.urdf clouds/ --joints joints.csv -o base", "calibrate hand frames/ -o my_hand")),
     (demo, "Run the main job on built-in data.", ("demo", "demo --frames 20 --seed 3 -o here")),
+    (export, "Write a file of another program, a table or a picture from a result.",
+     ("export moving.safetensors -o moving.bvh", "export spine.safetensors --data meshes/ -o spine.gif")),
     (figure, "Draw the bending skin, or the picture of the README.", ("figure bending", "figure readme -o readme.svg")),
     (formats, "Show the formats of files that are read.", ("formats", "formats | grep -A 3 Cameras")),
     (info, "Show the degrees of freedom and parts of a shape, or what a result holds.",
@@ -73,13 +77,13 @@ _COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
     (label, "Label point clouds with poses, to train networks on.",
      ("label hand frames/ -o labels", "label hand frames.npz --start pose.json --trusted 0.8")),
     (spine, "Extract the moving skeleton of a sequence of meshes.",
-     ("spine meshes/ -o spine.glb --table limbs.csv", "spine meshes/*.obj --movie spine.gif --up y")),
+     ("spine meshes/ -o spine.glb", "spine meshes/*.obj --up y --tips 5")),
     (pose, "Pose a registered scan by dragging points.",
      ("pose moved.safetensors", "pose moved.safetensors --handle 0.1,0,2 --to 0.2,0,2 -o posed.ply")),
     (register, "Register two range scans of something that moves.",
      ("register a.ply b.ply -o moved.glb", "register --depth a.png b.png --intrinsics camera.json")),
     (track, "Follow a shape through a sequence of clouds.",
-     ("track hand frames/ -o moving --poses poses.csv --bvh moving.bvh",
+     ("track hand frames/ -o moving",
       "track hand depth/ --depth --intrinsics camera.json")),
     (train_initializer, "Train a network that proposes poses of a shape.",
      ("train-initializer rig.glb -o rig.safetensors", "train-initializer hand --device cuda --batch 512 --minutes 5")),
@@ -90,4 +94,5 @@ _COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
 for _command, _help, _examples in _COMMANDS:
     # The control character keeps the lines as they are.
     _lines = "\n".join(f"  torchreg {example}" for example in _examples)
-    app.command(cls=Command, short_help=_help, epilog=f"\b\nExamples:\n{_lines}")(_command)
+    _more = f"\n\n\b\nFiles of results:\n{endings_help()}" if _command is export else ""
+    app.command(cls=Command, short_help=_help, epilog=f"\b\nExamples:\n{_lines}{_more}")(_command)

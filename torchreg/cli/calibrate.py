@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
-from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, Seen, check_used, depth_source, seen_folder
+from torchreg.cli.cameras import DepthOptions, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
-from torchreg.cli.shape_argument import PackageDir, Shape, load_shape
+from torchreg.cli.shape_argument import PackageDir, Shape, ShapeOptions
+from torchreg.cli.writers import Source, write_optional
 from torchreg.errors import FramesWarning, InputError
 
 if TYPE_CHECKING:
@@ -49,10 +50,8 @@ def calibrate(
             "--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written, and more."
         ),
     ] = Path("calibration"),
-    depth: Depth = False,
-    intrinsics: Intrinsics = None,
-    mask: Mask = None,
-    depth_range: DepthRange = None,
+    *,
+    views: DepthOptions,
     offsets: Annotated[bool, typer.Option("--offsets", help="Look for constant offsets of the joints, too.")] = False,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -76,27 +75,27 @@ def calibrate(
     is_hand = not Path(shape).suffix
     transform = None if is_hand else output.with_name(f"{output.stem}_transform.json")
     check_outputs([output, output.with_suffix(".json"), transform], force)
-    robot_options = {"--joints": joints, "--depth": depth or None, "--offsets": offsets or None, "--seen": seen}
-    camera_options = {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range}
     if is_hand:
-        check_used(False, "a robot", {**robot_options, **camera_options})
-    check_used(depth, "--depth", camera_options)
-    frames, images = _given_frames(frames, depth, intrinsics, mask, depth_range)
-    model = load_shape(shape, package_dirs=package_dir)
-    if is_hand or transform is None:
+        robot = {"--joints": joints, "--depth": views.depth or None, "--offsets": offsets or None, "--seen": seen}
+        camera = {"--intrinsics": views.intrinsics, "--mask": views.mask, "--depth-range": views.depth_range}
+        check_used(False, "a robot", robot | camera)
+    views.check()
+    images = views.source(frames) if views.depth else None
+    frames = cloud_files(frames) if images is None else [Path(name) for name in images.names]
+    model = ShapeOptions(package_dir=package_dir).load(shape)
+    if is_hand:
         _calibrate_hand(model, frames, [read_cloud(path, scale, nan_policy) for path in frames], output, quiet)
         return
     if joints is None:
         raise InputError("a robot takes --joints TABLE.csv with the joints of each frame")
     rows = _read_joints(joints, model, frames)
-    given: Sequence[Any] = images or [read_cloud(path, scale, nan_policy) for path in frames]
+    given: Sequence[Any] = list(images or [read_cloud(path, scale, nan_policy) for path in frames])
     folder = seen_folder(seen, output, force)
     from torchreg.alignment.calibrate_base import calibrate_base
 
     found = calibrate_base(model, given, rows, offsets)
     found.save(output)
-    with OptionalOutput(transform):
-        _write_transform(transform, model, found)
+    write_optional([transform], Source([found], shape=model))
     with OptionalOutput(folder):
         _draw_frames(folder, model, found, frames, given, rows)
     if not quiet:
@@ -119,16 +118,6 @@ def _read_joints(path: Path, shape: ArticulatedShape, frames: Sequence[Path]) ->
     return rows
 
 
-def _given_frames(
-    frames: list[Path], depth: bool, intrinsics: Path | None, mask: Path | None, depths: tuple[float, float] | None
-) -> tuple[list[Path], list[DepthFrame]]:
-    """Return the files that are meant, and of depth pictures what they show."""
-    if not depth:
-        return cloud_files(frames), []
-    source = depth_source(frames, intrinsics, mask, depths)
-    return [Path(name) for name in source.names], list(source)
-
-
 def _calibrate_hand(
     shape: ArticulatedShape, paths: Sequence[Path], clouds: Sequence[Tensor], output: Path, quiet: bool
 ) -> None:
@@ -147,37 +136,6 @@ def _calibrate_hand(
         typer.echo(f"{found.status.value}: lengths {length:.3f} times those of the shape on average -> {output}")
     if not found.status.usable:
         raise typer.Exit(ExitCode.UNUSABLE)
-
-
-def transform_record(shape: ArticulatedShape, found: BaseCalibration) -> Mapping[str, Any]:
-    """Return a calibration as plain numbers, with the command by which ROS 2 publishes it."""
-    from torchreg.geometry.rotation import so3_log
-    from torchreg.geometry.rotation_representations import quaternion_from_rotation_vector
-
-    base = found.T_camera_base
-    w, x, y, z = quaternion_from_rotation_vector(so3_log(base[None, :3, :3])[0]).tolist()
-    place = dict(zip("xyz", base[:3, 3].tolist(), strict=True))
-    turn = {"qx": x, "qy": y, "qz": z, "qw": w}
-    options = " ".join(f"--{name} {value:.9g}" for name, value in (place | turn).items())
-    publish = f"ros2 run tf2_ros static_transform_publisher {options} --frame-id camera --child-frame-id"
-    return {
-        "T_camera_base": base.tolist(),
-        "translation": place,
-        "rotation": turn,
-        "std_translation_m": found.covariance.diagonal()[:3].sqrt().tolist(),
-        "std_rotation_rad": found.covariance.diagonal()[3:].sqrt().tolist(),
-        "offsets": dict(zip(shape.dof_names[6:], found.offsets.tolist(), strict=True)),
-        "residuals_m": found.residuals.tolist(),
-        "outliers": list(found.outliers),
-        "status": found.status.value,
-        "ros2": f"{publish} {shape.part_names[0]}",
-    }
-
-
-def _write_transform(path: Path, shape: ArticulatedShape, found: BaseCalibration) -> None:
-    from torchreg.io.atomic import write_atomic
-
-    write_atomic(path, (json.dumps(transform_record(shape, found), indent=2) + "\n").encode())
 
 
 def _draw_frames(
@@ -231,8 +189,6 @@ def _draw_over(picture: Path, frame: DepthFrame, vertices: Tensor, faces: Tensor
 
 def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Path]) -> str:
     """Return what was found in one line: its uncertainty, outlier frames, offsets."""
-    import math
-
     std = found.covariance.diagonal().sqrt()
     words = [
         f"{found.status}: base within {1e3 * float(std[:3].max()):.1f} mm and "
@@ -243,9 +199,9 @@ def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Pa
         words.append(
             "does not show the robot there, or in other joints: " + ", ".join(paths[k].name for k in found.outliers)
         )
-    told = [
+    moved = [
         f"{name} {math.degrees(value):+.2f} degrees"
         for name, value in zip(shape.dof_names[6:], found.offsets.tolist(), strict=True)
         if value
     ]
-    return "; ".join([*words, *(["offsets " + ", ".join(told)] if told else [])])
+    return "; ".join([*words, *(["offsets " + ", ".join(moved)] if moved else [])])

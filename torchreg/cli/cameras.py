@@ -1,13 +1,15 @@
-"""Options of commands that read pictures, and the folder of pictures that they write."""
+"""Options of commands that read pictures, and the folder of the pictures that they write."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchreg.cli.align_options import cloud_files
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,10 +29,6 @@ DepthRange = Annotated[
     tuple[float, float] | None,
     typer.Option(metavar="NEAR FAR", help="Depths of interest, metres; what lies beyond is background."),
 ]
-Volume = Annotated[
-    tuple[float, float, float, float, float, float] | None,
-    typer.Option(metavar="X Y Z X Y Z", help="Lower and upper corner of the volume of interest, metres."),
-]
 Depth = Annotated[
     bool,
     typer.Option(
@@ -41,17 +39,6 @@ Intrinsics = Annotated[Path | None, typer.Option(metavar="FILE", help="The camer
 Mask = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Picture whose bright pixels may show the shape; or a folder, one per picture."),
-]
-Matcher = Annotated[
-    str | None,
-    typer.Option(help="How pictures are matched: semi-global, block, or opencv, the default where it is installed."),
-]
-Reach = Annotated[
-    float | None,
-    typer.Option(
-        help="Crop what crosses the border of the picture, as a forearm, at this distance from its far end, metres; 0 "
-        "keeps it. By default the length of a hand; other shapes keep all."
-    ),
 ]
 Seen = Annotated[
     Path | None,
@@ -86,73 +73,113 @@ def load_calibration(calibration: Path | None, flag: str, scale: float = 1.0) ->
     return load_cameras(calibration, scale=scale)
 
 
-def depth_source(
-    paths: list[Path], intrinsics: Path | None, mask: Path | None, depths: tuple[float, float] | None
-) -> DepthFrames:
-    """Return the frames of depth pictures."""
-    from torchreg.capture.depth_frames import DepthFrames
+@dataclass(frozen=True)
+class DepthOptions:
+    """What depth pictures are read with."""
 
-    if intrinsics is None:
-        raise InputError("--depth takes --intrinsics FILE with the camera")
-    nearest, farthest = depths or (0.0, float("inf"))
-    return DepthFrames(paths, intrinsics, mask, nearest=nearest, farthest=farthest)
+    depth: Depth = False
+    intrinsics: Intrinsics = None
+    mask: Mask = None
+    depth_range: DepthRange = None
+
+    def check(self, *, stereo: bool | None = None) -> None:
+        """Raise InputError if options are given that have no meaning."""
+        check_used(self.depth, "--depth", {"--intrinsics": self.intrinsics, "--mask": self.mask})
+        flag = "--depth" if stereo is None else "--stereo or --depth"
+        check_used(self.depth or bool(stereo), flag, {"--depth-range": self.depth_range})
+
+    def source(self, paths: list[Path]) -> DepthFrames:
+        """Return the frames of depth pictures."""
+        from torchreg.capture.depth_frames import DepthFrames
+
+        if self.intrinsics is None:
+            raise InputError("--depth takes --intrinsics FILE with the camera")
+        nearest, farthest = self.depth_range or (0.0, float("inf"))
+        return DepthFrames(paths, self.intrinsics, self.mask, nearest=nearest, farthest=farthest)
+
+    def job(self, frames: Any) -> dict[str, Any]:
+        """Return all settings that determine the frames of depth pictures, as plain data."""
+        if not self.depth:
+            return {}
+        return {"--depth": True, "--depth-range": [str(limit) for limit in frames.depths], "--mask": list(frames.masks)}
+
+    def frames(self, paths: list[Path], scale: float, nan_policy: str) -> Any:
+        """Return the frames of depth pictures, or of clouds."""
+        from torchreg.io.frames import load_frames
+
+        if self.depth:
+            return self.source(paths)
+        return load_frames(cloud_files(paths), scale=scale, nan_policy=nan_policy)
 
 
-def depth_job(frames: DepthFrames) -> dict[str, Any]:
-    """Return all settings that determine the frames of depth pictures, as plain data."""
-    return {"--depth": True, "--depth-range": [str(limit) for limit in frames.depths], "--mask": list(frames.masks)}
+@dataclass(frozen=True)
+class StereoOptions:
+    """What stereo pictures are read with."""
 
+    stereo: Annotated[
+        bool, typer.Option("--stereo", help="FRAMES are the pictures of a calibrated pair of cameras.")
+    ] = False
+    calibration: Calibration = None
+    volume: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X Y Z X Y Z", help="Lower and upper corner of the volume of interest, metres."),
+    ] = None
+    matcher: Annotated[
+        str | None,
+        typer.Option(
+            help="How pictures are matched: semi-global, block, or opencv, the default where it is installed."
+        ),
+    ] = None
+    reach: Annotated[
+        float | None,
+        typer.Option(
+            help="Crop what crosses the border of the picture, as a forearm, at this distance from its far end, "
+            "metres; 0 keeps it. By default the length of a hand; other shapes keep all."
+        ),
+    ] = None
 
-def stereo_source(
-    folders: list[Path],
-    calibration: Path | None,
-    shape: ArticulatedShape,
-    depths: tuple[float, float] | None,
-    volume: tuple[float, ...] | None,
-    matcher: str | None,
-    reach: float | None,
-    scale: float = 1.0,
-) -> StereoFrames:
-    """Return the clouds of stereo pictures, after a check of the first pair for swapped cameras."""
-    from importlib.util import find_spec
+    def check(self, seen: Path | None, views: DepthOptions) -> None:
+        """Raise InputError if options are given that have no meaning, of stereo or of depth pictures."""
+        given = {"--calibration": self.calibration, "--volume": self.volume, "--matcher": self.matcher}
+        check_used(self.stereo, "--stereo", given | {"--reach": self.reach, "--seen": seen})
+        views.check(stereo=self.stereo)
 
-    import torch
+    def source(
+        self, folders: list[Path], shape: ArticulatedShape, depths: tuple[float, float] | None, scale: float
+    ) -> StereoFrames:
+        """Return the clouds of stereo pictures, after a check of the first pair for swapped cameras."""
+        from importlib.util import find_spec
 
-    from torchreg.capture.stereo import StereoConfig
-    from torchreg.capture.stereo_frames import StereoFrames
-    from torchreg.shapes.hand import Hand
+        import torch
 
-    if len(folders) != 2:
-        raise InputError(
-            f"--stereo takes two folders as FRAMES, the left pictures and the right ones; got {len(folders)}"
-        )
-    rig = load_calibration(calibration, "--stereo", scale)
-    if len(rig) != 2:
-        raise InputError(f"--calibration must hold the left and the right camera, in this order; got {len(rig)}")
-    method = matcher or ("opencv" if find_spec("cv2") else "semi-global")
-    near, far = depths or (StereoConfig.nearest, StereoConfig.farthest)
-    if reach is None and isinstance(shape, Hand):
-        reach = shape.length
-    frames = StereoFrames(
-        folders[0],
-        folders[1],
-        rig.stereo(),
+        from torchreg.capture.stereo import StereoConfig
+        from torchreg.capture.stereo_frames import StereoFrames
+        from torchreg.shapes.hand import Hand
+
+        if len(folders) != 2:
+            raise InputError(
+                f"--stereo takes two folders as FRAMES, the left pictures and the right ones; got {len(folders)}"
+            )
+        rig = load_calibration(self.calibration, "--stereo", scale)
+        if len(rig) != 2:
+            raise InputError(f"--calibration must hold the left and the right camera, in this order; got {len(rig)}")
+        method = self.matcher or ("opencv" if find_spec("cv2") else "semi-global")
+        near, far = depths or (StereoConfig.nearest, StereoConfig.farthest)
+        reach = shape.length if self.reach is None and isinstance(shape, Hand) else self.reach
         # Corners alone may be too few where fingers point at the camera.
-        config=StereoConfig(nearest=near, farthest=far, method=method, least=500),
-        box=None if volume is None else torch.tensor(volume).reshape(2, 3),
-        reach=reach or None,
-    )
-    frames.sight(0)
-    return frames
+        config = StereoConfig(nearest=near, farthest=far, method=method, least=500)
+        box = None if self.volume is None else torch.tensor(self.volume).reshape(2, 3)
+        frames = StereoFrames(folders[0], folders[1], rig.stereo(), config=config, box=box, reach=reach or None)
+        frames.sight(0)
+        return frames
 
-
-def stereo_job(frames: StereoFrames) -> dict[str, Any]:
-    """Return all settings that determine the clouds of stereo pictures, as plain data."""
-    from dataclasses import asdict
-
-    cameras = [
-        [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.distortion.tolist()]
-        for camera in (frames.pair.left, frames.pair.right)
-    ]
-    box = None if frames.box is None else frames.box.tolist()
-    return {"cameras": cameras, "configuration": asdict(frames.config), "--volume": box, "--reach": frames.reach}
+    def job(self, frames: Any) -> dict[str, Any]:
+        """Return all settings that determine the clouds of stereo pictures, as plain data."""
+        if not self.stereo:
+            return {}
+        cameras = [
+            [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.distortion.tolist()]
+            for camera in (frames.pair.left, frames.pair.right)
+        ]
+        box = None if frames.box is None else frames.box.tolist()
+        return {"cameras": cameras, "configuration": asdict(frames.config), "--volume": box, "--reach": frames.reach}

@@ -9,6 +9,7 @@ import typer
 
 from torchreg.cli.outputs import Force, Quiet, check_outputs, counted
 from torchreg.cli.reporting import OptionalOutput, interruption, reporting
+from torchreg.cli.writers import Source, write_optional
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,24 +42,21 @@ def demo(
 
     from tqdm import tqdm
 
-    from torchreg.cli.pose_files import write_poses
-    from torchreg.geometry.upright import guess_up
     from torchreg.shapes.hand import Hand
     from torchreg.tracking.demo import DEMO_FPS, run_demo
-    from torchreg.viz.tracking import animate_track, save_track_gltf
+    from torchreg.viz.tracking import animate_track
 
     with tqdm(total=frames, unit="frame", desc="tracking", leave=False, disable=quiet) as bar:
         result = run_demo(frames, seed, on_frame=lambda done, planned: bar.update())
     count, hand = len(result.clouds), Hand()
     result.save(track)
-    with OptionalOutput(poses):
-        write_poses(poses, result.track)
+    source = Source([result.track], shape=hand)
+    write_optional([poses], source)
     if not quiet:
         typer.echo(_speed(result))
         _print_tip_errors("all", result.tip_errors.flatten())
         _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
-    with OptionalOutput(scene):
-        save_track_gltf(scene, hand, result.track, up=guess_up(list(result.track.keypoints)))
+    write_optional([scene], source)
     if not no_movie:
         bar = tqdm(total=count, unit="frame", desc="drawing", leave=False, disable=quiet)
         with OptionalOutput(movie), bar:

@@ -13,15 +13,7 @@ _OPTIONS = {"package_dirs": "--package-dir"}
 
 
 def in_options(message: str, options: Iterable[str]) -> str:
-    """Return a message in which arguments of functions are the options of a command.
-
-    The part between semicolons that names an argument which the command does not have is left out: a hint that cannot
-    be followed is worse than none.
-
-    Args:
-        message: of an error or a warning.
-        options: of the command, as in ``--nan-policy``.
-    """
+    """Return a message with arguments of functions as options of a command, without hints that it cannot follow."""
     known = set(options)
     parts = _LIMITS.sub("", " ".join(message.split())).split("; ")
     told = [part if (found := _translated(part, known)) is None else found for part in parts]

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchreg.cli.outputs import result_file
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Skin, load_shape
+from torchreg.cli.shape_argument import ShapeOptions
 from torchreg.cli.view import is_result
 
 if TYPE_CHECKING:
@@ -25,19 +26,16 @@ def info(
             help="hand, hand-left, a robot (.urdf), a rigged character (.glb, .gltf), or a result (.safetensors).",
         ),
     ],
-    parents: Parents = None,
-    package_dir: PackageDir = None,
-    free_base: FreeBase = None,
-    skin: Skin = None,
+    options: ShapeOptions,
 ) -> None:
     """Show the degrees of freedom of a shape with their limits, and its parts; or what a result holds."""
     if is_result(Path(what)):
-        _tell_result(Path(what))
+        _show_result(Path(what))
     else:
-        _tell_shape(what, load_shape(what, parents, package_dir, free_base, skin))
+        _show_shape(what, options.load(what))
 
 
-def _tell_shape(name: str, model: ArticulatedShape) -> None:
+def _show_shape(name: str, model: ArticulatedShape) -> None:
     rest = model.surface.vertices if model.surface is not None else model.surface_mesh().vertices
     size = float((rest.amax(0) - rest.amin(0)).norm())
     surface = "the file's mesh" if model.surface is not None else "fused solids"
@@ -58,10 +56,10 @@ def _units(model: ArticulatedShape) -> list[tuple[str, float]]:
     return [("m", 1.0) if slides else ("deg", 180 / math.pi) for slides in model.is_sliding.tolist()]
 
 
-def _tell_result(path: Path) -> None:
+def _show_result(path: Path) -> None:
     from torchreg.storage import load
 
-    found: Any = load(path if path.suffix.lower() == ".safetensors" else path.with_suffix(".safetensors"))
+    found: Any = load(result_file(path))
     typer.echo(f"{path}: {type(found).__name__}\n")
     rows = found.summary()
     width = max(len(name) for name, _ in rows)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
-from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
-from torchreg.cli.initializer_option import Initializer, read_initializer
+from torchreg.cli.align_options import NanPolicy, Scale
+from torchreg.cli.cameras import DepthOptions
+from torchreg.cli.known_options import Initializer, read_initializer
 from torchreg.cli.outputs import Force, Quiet, check_outputs
 from torchreg.cli.reporting import interruption, reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
+from torchreg.cli.shape_argument import Shape, ShapeOptions
 
 
 @reporting
@@ -30,6 +30,7 @@ def label(
         Path,
         typer.Option("--output", "-o", metavar="FOLDER", help="Labels are written here; created where it is missing."),
     ] = Path("labels"),
+    *,
     start: Annotated[
         Path | None, typer.Option(help="Pose of the first frame, as for align; searched by default.")
     ] = None,
@@ -37,16 +38,10 @@ def label(
     trusted: Annotated[
         float, typer.Option(help="Poses less sure than this are not started from: the next frame is searched.")
     ] = 0.5,
-    depth: Depth = False,
-    intrinsics: Intrinsics = None,
-    mask: Mask = None,
-    depth_range: DepthRange = None,
+    views: DepthOptions,
     nan_policy: NanPolicy = "raise",
     scale: Scale = 1.0,
-    parents: Parents = None,
-    package_dir: PackageDir = None,
-    free_base: FreeBase = None,
-    skin: Skin = None,
+    options: ShapeOptions,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -59,15 +54,10 @@ def label(
     from tqdm import tqdm
 
     from torchreg._checks import check_positive
-    from torchreg.io.frames import load_frames
 
     check_positive(scale, "--scale")
-    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range})
-    sequence: Any
-    if depth:
-        sequence = depth_source(frames, intrinsics, mask, depth_range)
-    else:
-        sequence = load_frames(cloud_files(frames), scale=scale, nan_policy=nan_policy)
+    views.check()
+    sequence = views.frames(frames, scale, nan_policy)
     with tqdm(total=len(sequence), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
         from torchreg.alignment.pose_initializer import PoseInitializer
         from torchreg.alignment.pseudo_labels import label_frames
@@ -77,7 +67,7 @@ def label(
         output.mkdir(exist_ok=True)
         paths = [label_path(output, number) for number in range(len(sequence))]
         check_outputs([path.with_suffix(ending) for path in paths for ending in (".safetensors", ".json")], force)
-        model = load_shape(shape, parents, package_dir, free_base, skin)
+        model = options.load(shape)
         first = None if start is None else load_pose(start, model)
         network = PoseInitializer(model, proposer=read_initializer(initializer, model))
         done = 0

@@ -12,13 +12,15 @@ _ELSEWHERE = {
     "--num-bones": "--bones", "--grid-resolution": "--grid", "--resolution": "--grid", "--num-tips": "--tips",
     "--num-samples": "--samples", "--out": "--output", "--output-dir": "--output", "--units": "--scale",
     "--unit": "--scale", "--camera": "--intrinsics", "--cameras": "--calibration", "--initial-pose": "--start",
-    "--init": "--start", "--gif": "--movie", "--mp4": "--movie", "--video": "--movie", "--glb": "--gltf",
+    "--init": "--start",
     "--overwrite": "--force", "--threads": "--workers", "--jobs": "--workers", "--image": "--picture",
-    "--standing": "--upright", "--masks": "--mask", "--overlay": "--pictures", "--resume": "--progress",
+    "--standing": "--upright", "--masks": "--mask", "--resume": "--progress",
     "--progress": "--resume",
 }  # fmt: skip
+_EXPORTED = "torchreg export writes it from the result"
 # What a command may well not have, and why.
 _NOWHERE = {
+    **dict.fromkeys(("--gif", "--mp4", "--video", "--glb", "--csv", "--obj", "--overlay"), _EXPORTED),
     "--seed": "nothing that this command draws at random is to be seeded: it gives the same result every time",
     "--device": "commands compute on the CPU; in Python, move shape and data with .to()",
     "--gpu": "commands compute on the CPU; in Python, move shape and data with .to()",
@@ -26,7 +28,7 @@ _NOWHERE = {
 
 
 class Command(TyperCommand):
-    """A command that tells which option was meant."""
+    """A command that names the option that was probably meant."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments of the command line."""

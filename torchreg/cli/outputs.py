@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, overload
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -16,6 +16,8 @@ from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+Given = TypeVar("Given", Path, Path | None)
 
 fcntl: ModuleType | None
 try:
@@ -37,18 +39,8 @@ Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs that exi
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 
 
-@overload
-def with_ending(path: Path, endings: Sequence[str], *, add: bool = ...) -> Path: ...
-@overload
-def with_ending(path: None, endings: Sequence[str], *, add: bool = ...) -> None: ...
-@overload
-def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = ...) -> Path | None: ...
-def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = False) -> Path | None:
-    """Return the path of an output; InputError if its ending is not allowed.
-
-    With ``add`` the path names a result, whose files have several endings: one of these is exchanged for the first of
-    ``endings``, another kind of file's is refused, and a name without an ending, or with a dot in it, gets it.
-    """
+def with_ending(path: Given, endings: Sequence[str], *, add: bool = False) -> Given:
+    """Return the path of an output; InputError if its ending is not allowed; with ``add`` names of results get it."""
     if path is None or (ending := path.suffix.lower()) in endings:
         return path
     if add and ending in _BESIDE:
@@ -58,17 +50,16 @@ def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = False)
     raise InputError(f"{path} must end in {', '.join(endings)}; rename the output")
 
 
-@overload
-def numbered(path: Path, index: int, count: int) -> Path: ...
-@overload
-def numbered(path: None, index: int, count: int) -> None: ...
-@overload
-def numbered(path: Path | None, index: int, count: int) -> Path | None: ...
-def numbered(path: Path | None, index: int, count: int) -> Path | None:
+def numbered(path: Given, index: int, count: int) -> Given:
     """Return the path of output number ``index`` of ``count``: the same for a single one, else as in name_01.ply."""
     if path is None or count == 1:
         return path
     return path.with_name(f"{path.stem}_{index + 1:0{len(str(count))}}{path.suffix}")
+
+
+def result_file(name: Path) -> Path:
+    """Return the .safetensors file of a result that is named without ending, or by its .json file."""
+    return name.with_suffix(".safetensors") if name.suffix.lower() in ("", ".json") else name
 
 
 def counted(number: int, thing: str) -> str:

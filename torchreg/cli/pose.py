@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, result_file, with_ending
 from torchreg.cli.reporting import reporting
 from torchreg.cli.upright import Up, check_up
 from torchreg.cli.view import Browser, Port, wait_for_interrupt
+from torchreg.errors import FormatError, InputError
 
 if TYPE_CHECKING:
     from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
@@ -69,17 +70,16 @@ def pose(
 
 def _load(result: Path, start: Path | None) -> tuple[ScanRegistration | SequenceRegistration, PoseSolution | None]:
     """Return a registration and, if one is given, a pose to start from."""
-    from torchreg.errors import FormatError
     from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
     from torchreg.storage import load
 
-    path = result if result.suffix else result.with_suffix(".safetensors")
+    path = result_file(result)
     found = load(path)
     if not isinstance(found, (ScanRegistration, SequenceRegistration)):
         raise FormatError(f"{path} holds a {type(found).__name__}; a pose is solved for a ScanRegistration")
     if start is None:
         return found, None
-    first = load(start if start.suffix else start.with_suffix(".safetensors"))
+    first = load(result_file(start))
     if not isinstance(first, PoseSolution):
         raise FormatError(f"{start} holds a {type(first).__name__}; a pose to start from is a PoseSolution")
     return found, first
@@ -88,7 +88,6 @@ def _load(result: Path, start: Path | None) -> tuple[ScanRegistration | Sequence
 def _pose_once(editor: PoseEditor, handle: list[str], to: list[str], path: Path, quiet: bool) -> None:
     import torch
 
-    from torchreg.errors import InputError
     from torchreg.registration.solve_pose import solve_pose
     from torchreg.viz.bone_colors import save_weight_ply
 
@@ -104,8 +103,6 @@ def _pose_once(editor: PoseEditor, handle: list[str], to: list[str], path: Path,
 
 def _point(text: str) -> list[float]:
     """Return three numbers, separated by commas or blanks."""
-    from torchreg.errors import InputError
-
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, cloud_files
+from torchreg.cli.align_options import NanPolicy, Support, cloud_files
 from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
+from torchreg.cli.export import Old, check_old
+from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
-from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
-from torchreg.cli.support_option import Support
 from torchreg.cli.upright import Up, known_up, remembering
+from torchreg.cli.writers import Source, joint_table, save_robot, write_optional
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,11 +25,10 @@ if TYPE_CHECKING:
 
     from torchreg.geometry.camera import Camera
     from torchreg.geometry.range_scan import RangeScan
-    from torchreg.registration.results import RegisterRecord, ScanRegistration
+    from torchreg.registration.results import RegisterRecord, ScanRegistration, SequenceRegistration
+    from torchreg.registration.robots.model import RobotModel
 
 _DEFAULT = Path("registered.glb")
-# Pictures of the depth of source and target that was kept.
-_KEPT = ("source.png", "target.png")
 
 
 @reporting
@@ -76,10 +76,8 @@ def register(
     frame: Annotated[
         list[int] | None, typer.Option(help="Number of the keyframe of a .glb file's animation; twice for both.")
     ] = None,
-    weights: Annotated[Path | None, typer.Option(help="Also write the moved source, colored by bones (.ply).")] = None,
-    errors: Annotated[
-        Path | None, typer.Option(help="Also write the moved source, colored by its distance from the target (.ply).")
-    ] = None,
+    weights: Old = None,
+    errors: Old = None,
     up: Up = None,
     urdf: Annotated[
         bool,
@@ -105,48 +103,35 @@ def register(
     for an error; 130 for Ctrl-C.
     """
     scans = cloud_files(scans) if not depth else scans
+    views = {"--intrinsics": intrinsics, "--depth-range": depth_range, "--smoothing": smoothing, "--seen": seen}
+    read = partial(_read, scans, (scale, time, frame), nan_policy)
     if urdf:
-        check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,
-                     "--smoothing": smoothing, "--weights": weights, "--errors": errors, "--up": up,
-                     "--support": support != "auto"})  # fmt: skip
-        units = _common(scale, "--scale"), _common(time, "--time"), _common(frame, "--frame")
-        _write_robot(scans, output, bones, grid, units, nan_policy, force=force, quiet=quiet)
+        others = {"--weights": weights, "--errors": errors, "--up": up, "--support": support != "auto"}
+        _check_unused({"--depth": depth, **views, **others})
+        _write_robot(read, scans, output, bones, grid, force, quiet)
         return
-    source, target = _two(scans)
+    if len(scans) != 2:
+        raise InputError(f"register takes two scans, source and target, got {len(scans)}; more need --urdf")
     output = with_ending(output, (".glb", ".safetensors"), add=True)
     result = output.with_suffix(".safetensors")
     scene = output if output.suffix.lower() == ".glb" else None
-    weights, errors = with_ending(weights, (".ply",)), with_ending(errors, (".ply",))
+    check_old({"--weights": (weights, ".ply")}, result)
+    check_old({"--errors": (errors, ".ply")}, result, " --color distance")
     check_outputs([scene, result, result.with_suffix(".json"), weights, errors], force)
-    from tqdm import tqdm
-
-    from torchreg.io.scans import load_scan
-    from torchreg.registration.register import register as run
-
-    views = {"--intrinsics": intrinsics, "--depth-range": depth_range, "--smoothing": smoothing, "--seen": seen}
     check_used(depth, "--depth", views)
     if depth:
         folder = seen_folder(seen, output, force)
-        images = [_DepthImage.read(*pair) for pair in zip((source, target), _cameras(intrinsics), strict=True)]
-        kept = [folder / name for name in _KEPT]
-        first, second = (
-            image.scan(depth_range, smoothing or 0.0, path) for image, path in zip(images, kept, strict=True)
-        )
+        images, pair = _depth_pair(scans, intrinsics, depth_range, smoothing or 0.0, folder)
     else:
-        pairs = _pair(scale, 1.0, "--scale"), _pair(time, None, "--time"), _pair(frame, None, "--frame")
-        first, second = (
-            load_scan(path, scale=unit, nan_policy=nan_policy, time=seconds, frame=number)
-            for path, unit, seconds, number in zip((source, target), *pairs, strict=True)
-        )
-    if scene is not None and first.faces is None:
+        pair = read(2)
+    if scene is not None and pair[0].faces is None:
         if output.name != _DEFAULT.name:
-            raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
+            raise InputError(f"{scans[0]} has no triangles, which a .glb needs; name an output ending in .safetensors")
         scene = None
-    with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
-        found = run(first, second, bones, grid, on_step=partial(_show, bar), support=support)
-    found = remembering(found, known_up(up, scans, camera=depth))
+    found = remembering(_registered(pair, bones, grid, support, quiet), known_up(up, scans, camera=depth))
     found.save(result)
-    _write(found, scene, weights, errors)
+    write_optional([scene, weights], Source([found]))
+    write_optional([errors], Source([found], color="distance"))
     if depth:
         with OptionalOutput(folder / "registered.png"):
             images[1].draw_over(found, folder / "registered.png")
@@ -156,30 +141,77 @@ def register(
         raise typer.Exit(ExitCode.UNUSABLE)
 
 
-def _two(scans: list[Path]) -> tuple[Path, Path]:
-    if len(scans) != 2:
-        raise InputError(f"register takes two scans, source and target, got {len(scans)}; more need --urdf")
-    return scans[0], scans[1]
+def _check_unused(options: dict[str, Any]) -> None:
+    """Raise InputError if options are given that a robot has no use for."""
+    for name, value in options.items():
+        if value:
+            raise InputError(f"{name} has no meaning with --urdf; leave it out")
+
+
+def _depth_pair(
+    paths: list[Path], intrinsics: list[Path] | None, depths: tuple[float, float] | None, smoothing: float, folder: Path
+) -> tuple[list[_DepthImage], list[RangeScan]]:
+    """Return depth images and their scans, and draw the depths that were kept."""
+    if intrinsics is None or len(intrinsics) > 2:
+        raise InputError("--depth takes --intrinsics FILE once, or twice where source and target have two cameras")
+    cameras = intrinsics[0], intrinsics[-1]
+    images = [_DepthImage.read(*pair) for pair in zip(paths, cameras, strict=True)]
+    kept = [folder / name for name in ("source.png", "target.png")]
+    return images, [image.scan(depths, smoothing, path) for image, path in zip(images, kept, strict=True)]
+
+
+def _read(
+    paths: list[Path], options: tuple[list[float] | None, list[float] | None, list[int] | None], policy: str, most: int
+) -> list[RangeScan]:
+    """Return scans; what is given once is said of all, twice of source and target."""
+    from torchreg.io.scans import load_scan
+
+    columns: list[list[Any]] = []
+    for name, given, default in zip(("--scale", "--time", "--frame"), options, (1.0, None, None), strict=True):
+        if given is not None and len(given) > most:
+            often = "once for both scans, or twice" if most > 1 else "once for all scans with --urdf"
+            raise InputError(f"{name} is given {often}, got {len(given)}")
+        columns.append(given if given and len(given) == 2 else (given or [default]) * len(paths))
+    return [
+        load_scan(path, scale=scale, nan_policy=policy, time=time, frame=frame)
+        for path, scale, time, frame in zip(paths, *columns, strict=True)
+    ]
+
+
+def _registered(pair: list[RangeScan], bones: int, grid: int, support: str, quiet: bool) -> ScanRegistration:
+    from tqdm import tqdm
+
+    from torchreg.registration.register import register as run
+
+    with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
+        return run(pair[0], pair[1], bones, grid, on_step=partial(_show, bar), support=support)
 
 
 def _write_robot(
-    paths: list[Path], output: Path, bones: int, grid: int, units: tuple[Any, Any, Any], nan_policy: NanPolicy,
-    *, force: bool, quiet: bool,
+    read: Callable[[int], list[RangeScan]], paths: list[Path], output: Path, bones: int, grid: int, force: bool,
+    quiet: bool,
 ) -> None:  # fmt: skip
-    """Read scans of a robot and write its description."""
+    """Register scans of a robot and write its description and its joint values in all of them."""
     from tqdm import tqdm
 
-    from torchreg.io.scans import load_scan
+    from torchreg.registration.register_sequence import register_sequence
 
-    files = RobotFiles.named(output, force)
-    scale, time, frame = units
-    scans = [
-        load_scan(path, scale=1.0 if scale is None else scale, nan_policy=nan_policy, time=time, frame=frame)
-        for path in paths
-    ]
+    urdf = with_ending(output, (".urdf",), add=True)
+    result, table = urdf.with_suffix(".safetensors"), joint_table(urdf)
+    check_outputs([urdf, result, result.with_suffix(".json"), table], force)
+    scans = read(1)
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
-        usable = write_scanned_robot(scans, paths, bones, grid, files, partial(_show, bar), not quiet)
-    if not usable:
+        found = register_sequence(scans, bones, grid, on_step=partial(_show, bar))
+    found.save(result)
+    with OptionalOutput(urdf):
+        robot = save_robot(urdf, Source([found], names=[path.name for path in paths]))
+        if not quiet:
+            typer.echo(f"{_robot_summary(found, robot)} -> {urdf}, {table}")
+            for name in robot.loose:
+                typer.echo(
+                    f"torchreg: {name} does not explain how its two links move: a part between may be missing", err=True
+                )
+    if not found.status.usable:
         raise typer.Exit(ExitCode.UNUSABLE)
 
 
@@ -233,49 +265,6 @@ class _DepthImage:
         save_image(picture, drawn)
 
 
-def _cameras(intrinsics: list[Path] | None) -> tuple[Path, Path]:
-    if intrinsics is None or len(intrinsics) > 2:
-        raise InputError("--depth takes --intrinsics FILE once, or twice where source and target have two cameras")
-    return intrinsics[0], intrinsics[-1]
-
-
-Given = TypeVar("Given")
-
-
-def _common(given: list[Given] | None, option: str) -> Given | None:
-    """Return what an option says about all scans."""
-    if given is not None and len(given) > 1:
-        raise InputError(f"{option} is given once for all scans with --urdf, got {len(given)}")
-    return given[0] if given else None
-
-
-def _pair(given: list[Given] | None, default: Any, option: str) -> tuple[Any, Any]:
-    """Return what an option that may be given once or twice says about source and target."""
-    if given is not None and len(given) > 2:
-        raise InputError(f"{option} is given once for both scans, or twice, got {len(given)}")
-    return (given[0], given[-1]) if given else (default, default)
-
-
-def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, errors: Path | None) -> None:
-    if scene is not None and found.faces is not None:
-        from torchreg.geometry.upright import guess_up
-        from torchreg.viz.scan_gltf import save_grid_animation
-
-        near = found.local()
-        with OptionalOutput(scene):
-            save_grid_animation(scene, near.model, near.points, found.faces, up=found.up or guess_up([found.points]))
-            tell_origin(scene, found.origin)
-    if weights is not None or errors is not None:
-        from torchreg.viz.bone_colors import save_error_ply, save_weight_ply
-
-        if weights is not None:
-            with OptionalOutput(weights):
-                save_weight_ply(weights, found.model, found.points, found.faces, moved=True)
-        if errors is not None:
-            with OptionalOutput(errors):
-                save_error_ply(errors, found.deformed, found.distances, found.faces)
-
-
 def _summary(found: ScanRegistration) -> str:
     seconds = ", ".join(
         f"{name} {value:.1f} s"
@@ -284,3 +273,14 @@ def _summary(found: ScanRegistration) -> str:
     share = float(found.matched.float().mean())
     sure = "" if found.confidence is None else f", confidence {found.confidence:.0%}"
     return f"{found.status}{sure}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"
+
+
+def _robot_summary(found: SequenceRegistration, robot: RobotModel) -> str:
+    kinds = [joint.kind for joint in robot.tree.joints[1:]]
+    size = float((found.points.amax(0) - found.points.amin(0)).norm())
+    sure = "" if found.confidence is None else f", confidence {float(found.confidence.min()):.0%} in the worst scan"
+    return (
+        f"{found.status}{sure}: {len(robot.tree)} links, {kinds.count('revolute')} hinges and "
+        f"{kinds.count('prismatic')} sliders; the joints leave the scans a median of "
+        f"{100 * float(robot.residuals.max()) / size:.2g} % of the size apart in the worst scan"
+    )

@@ -8,10 +8,11 @@ import sys
 import warnings
 from collections.abc import Callable
 from contextvars import ContextVar
+from dataclasses import fields, is_dataclass
 from enum import IntEnum
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any, TextIO, get_type_hints
 
 import typer
 from typer.models import OptionInfo
@@ -34,17 +35,24 @@ class ExitCode(IntEnum):
 
 
 def reporting(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with errors and warnings of the library printed in one line, and Ctrl-C as exit code 130."""
+    """Return the command with errors and warnings of the library printed in one line, and Ctrl-C as exit code 130.
+
+    A parameter that is a dataclass of options stands for these options.
+    """
+    parameters, groups = _expanded(command)
 
     @functools.wraps(command)
-    def run(*arguments: Any, **options: Any) -> None:
-        _options.set(options_of(command))
+    def run(**options: Any) -> None:
+        _options.set(options_of(run))
         _incomplete.set(False)
+        given = {
+            name: kind(**{item.name: options.pop(item.name) for item in fields(kind)}) for name, kind in groups.items()
+        }
         with warnings.catch_warnings():
             warnings.simplefilter("always", TorchregWarning)
             warnings.showwarning = show_warning
             try:
-                command(*arguments, **options)
+                command(**options, **given)
             except KeyboardInterrupt:
                 raise interruption() from None
             except BrokenPipeError:
@@ -55,18 +63,28 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
             if _incomplete.get():
                 raise typer.Exit(ExitCode.UNUSABLE)
 
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {item.name: item.annotation for item in parameters}
     return run
 
 
+def _expanded(command: Callable[..., None]) -> tuple[list[inspect.Parameter], dict[str, Any]]:
+    """Return the parameters of a command, each group replaced by its options, and the groups by name."""
+    groups, parameters = dict[str, Any](), list[inspect.Parameter]()
+    for given in inspect.signature(command, eval_str=True).parameters.values():
+        if is_dataclass(kind := given.annotation):
+            groups[given.name], hints = kind, get_type_hints(kind, include_extras=True)
+            parameters += [
+                inspect.Parameter(item.name, given.KEYWORD_ONLY, default=item.default, annotation=hints[item.name])
+                for item in fields(kind)
+            ]
+        else:
+            parameters.append(given.replace(kind=given.KEYWORD_ONLY))
+    return parameters, groups
+
+
 class OptionalOutput:
-    """A ``with`` block that draws, exports or tabulates: where it fails, a warning and exit code 1; no result is lost.
-
-    Args:
-        output: that is written, its path or what it is.
-
-    Attributes:
-        failed: whether a block did.
-    """
+    """A ``with`` block that draws or writes: where it fails, a warning and exit code 1; no result is lost."""
 
     def __init__(self, output: Path | str) -> None:
         self.output, self.failed = output, False
@@ -104,20 +122,19 @@ def show_warning(
 ) -> None:  # fmt: skip
     """Print a warning in one line, with file and line if it is not one of the library's."""
     origin = "" if issubclass(category, TorchregWarning) else f"{filename}:{lineno}: "
-    told = in_options(str(message), _options.get())
+    text = in_options(str(message), _options.get())
     from tqdm import tqdm
 
     with tqdm.external_write_mode(sys.stderr):  # on a line of its own, not behind a progress bar
-        typer.echo(f"torchreg: warning: {origin}{told}", err=True)
+        typer.echo(f"torchreg: warning: {origin}{text}", err=True)
 
 
 def options_of(command: Callable[..., None]) -> tuple[str, ...]:
     """Return the options of a command, as in ``--nan-policy``."""
     found = list[str]()
-    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+    for name, parameter in inspect.signature(command).parameters.items():
         declared = [item for item in getattr(parameter.annotation, "__metadata__", ()) if isinstance(item, OptionInfo)]
         for item in declared:
-            found += [word for word in item.param_decls or () if word.startswith("--")] or [
-                "--" + name.replace("_", "-")
-            ]
+            long = [word for word in item.param_decls or () if word.startswith("--")]
+            found += long or ["--" + name.replace("_", "-")]
     return tuple(found)

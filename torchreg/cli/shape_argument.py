@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,41 +35,49 @@ FreeBase = Annotated[
 ]
 
 
-def load_shape(
-    name: str,
-    parents: Path | None = None,
-    package_dirs: Sequence[Path] | None = None,
-    free_base: bool | None = None,
-    skin: str | None = None,
-) -> ArticulatedShape:
-    """Return the shape of a name or file; InputError if an option has no meaning for its kind."""
-    ending = Path(name).suffix.lower()
-    rigs = {"--parents", "--skin"}
-    uses = {".urdf": {"--package-dir", "--free-base/--fixed-base"}, ".glb": rigs, ".gltf": rigs}
-    given = {
-        "--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base,
-        "--skin": skin,
-    }  # fmt: skip
-    if name not in HANDS and name not in PEOPLE and ending not in uses:
-        raise InputError(
-            f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf, or one of {', '.join(PEOPLE)}; "
-            f"got {name!r}; {near_shape(name)}"
-        )
-    for option, value in given.items():
-        if value is not None and option not in uses.get(ending, set()):
-            raise InputError(f"{option} has no meaning for {name}; leave it out")
-    if name in HANDS:
-        from torchreg.shapes.hand import Hand
+@dataclass(frozen=True)
+class ShapeOptions:
+    """How the file of a shape is read."""
 
-        return Hand(HANDS[name])
-    from torchreg.shapes.articulated import ArticulatedShape
+    parents: Parents = None
+    package_dir: PackageDir = None
+    free_base: FreeBase = None
+    skin: Skin = None
 
-    if name in PEOPLE:
-        return ArticulatedShape.from_anny(PEOPLE[name])
-    if ending == ".urdf":
-        return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)
-    joined = None if parents is None else _read_parents(parents)
-    return ArticulatedShape.from_gltf(name, parents=joined, skin=chosen_skin(skin))
+    def given(self) -> dict[str, Any]:
+        """Return the options that are given, by name."""
+        values = {
+            "--parents": self.parents, "--package-dir": self.package_dir or None,
+            "--free-base/--fixed-base": self.free_base, "--skin": self.skin,
+        }  # fmt: skip
+        return {name: value for name, value in values.items() if value is not None}
+
+    def load(self, name: str) -> ArticulatedShape:
+        """Return the shape of a name or file; InputError if an option has no meaning for its kind."""
+        ending = Path(name).suffix.lower()
+        rigs = {"--parents", "--skin"}
+        uses = {".urdf": {"--package-dir", "--free-base/--fixed-base"}, ".glb": rigs, ".gltf": rigs}
+        if name not in HANDS and name not in PEOPLE and ending not in uses:
+            raise InputError(
+                f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf, or one of "
+                f"{', '.join(PEOPLE)}; got {name!r}; {near_shape(name)}"
+            )
+        for option in self.given():
+            if option not in uses.get(ending, set()):
+                raise InputError(f"{option} has no meaning for {name}; leave it out")
+        if name in HANDS:
+            from torchreg.shapes.hand import Hand
+
+            return Hand(HANDS[name])
+        from torchreg.shapes.articulated import ArticulatedShape
+
+        if name in PEOPLE:
+            return ArticulatedShape.from_anny(PEOPLE[name])
+        if ending == ".urdf":
+            folders, free = self.package_dir or (), self.free_base is not False
+            return ArticulatedShape.from_urdf(name, package_dirs=folders, free_base=free)
+        joined = None if self.parents is None else _read_parents(self.parents)
+        return ArticulatedShape.from_gltf(name, parents=joined, skin=chosen_skin(self.skin))
 
 
 def chosen_skin(skin: str | None) -> str | int | None:

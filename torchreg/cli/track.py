@@ -4,53 +4,67 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, person_summary
-from torchreg.cli.cameras import (
-    Calibration,
-    Depth,
-    DepthRange,
-    Intrinsics,
-    Mask,
-    Matcher,
-    Reach,
-    Seen,
-    Volume,
-    check_used,
-    depth_job,
-    depth_source,
-    seen_folder,
-    stereo_job,
-    stereo_source,
-)
-from torchreg.cli.initializer_option import Initializer, read_initializer
-from torchreg.cli.keypoint_options import Keypoints, KeypointStd, read_keypoints
-from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, tell_origin, with_ending
-from torchreg.cli.reporting import ExitCode, OptionalOutput, interruption, reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
-from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
+from torchreg.cli.align_options import FitShape, NanPolicy, Scale, fitted_shape, person_summary
+from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
+from torchreg.cli.export import Old, OldWord, check_old
+from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
+from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending
+from torchreg.cli.reporting import ExitCode, interruption, reporting
+from torchreg.cli.shape_argument import Shape, ShapeOptions
+from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary
 from torchreg.cli.upright import Up, Upright, known_up
 from torchreg.cli.view import Browser, Port, tell_url
+from torchreg.cli.writers import MOVIES
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.capture.depth_frames import DepthFrames
-    from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.geometry.upright import Direction
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
-    from torchreg.tracking.results import FrameResult, TrackResult
+    from torchreg.tracking.config import TrackConfig
+    from torchreg.tracking.results import FrameResult
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 
-MOVIES = ("gif", "mp4", "none")
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """The settings of a tracker."""
+
+    prediction: Annotated[str, typer.Option(help="Prediction of the motion: velocity, or none.")] = "velocity"
+    points: Annotated[int, typer.Option(help="Number of model points.")] = 500
+    model_points: Annotated[
+        str,
+        typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape."),
+    ] = "seen"
+    recovery: Annotated[
+        str, typer.Option(help="What finding a lost shape may cost: full, starts (milliseconds), or none.")
+    ] = "full"
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0
+    upright: Upright = False
+
+    def config(self, direction: Direction | None, clouds: Clouds) -> TrackConfig:
+        """Return the settings; what is upright is guessed from the first cloud where it is not known."""
+        from torchreg.geometry.upright import guess_up
+        from torchreg.tracking.tracker import TrackConfig
+
+        return TrackConfig(
+            model_points=self.model_points, num_model_points=self.points, prediction=self.prediction,
+            recovery=self.recovery, seed=self.seed,
+            upright=(direction or guess_up([clouds[0]])) if self.upright else None,
+        )  # fmt: skip
+
+    def job(self, config: TrackConfig) -> dict[str, Any]:
+        """Return the settings as plain data: what JSON gives back is equal to it."""
+        return {"configuration": asdict(config) | {"upright": config.upright and list(config.upright)}}
 
 
 @reporting
@@ -74,6 +88,7 @@ def track(
             help="RESULT.safetensors, .json, .glb, .gif and .progress are written.",
         ),
     ] = Path("track"),
+    *,
     start: Annotated[
         Path | None,
         typer.Option(
@@ -82,74 +97,27 @@ def track(
         ),
     ] = None,
     initializer: Initializer = None,
-    fit_shape: Annotated[
-        bool,
-        typer.Option(
-            "--fit-shape",
-            help="Also fit the shape's coefficients, as of a body to a person, or of a rig without any the lengths and "
-            "radii of its parts: the first frame tells them, and every other one more.",
-        ),
-    ] = False,
-    stereo: Annotated[
-        bool, typer.Option("--stereo", help="FRAMES are the pictures of a calibrated pair of cameras.")
-    ] = False,
-    calibration: Calibration = None,
-    depth: Depth = False,
-    intrinsics: Intrinsics = None,
-    mask: Mask = None,
-    depth_range: DepthRange = None,
-    volume: Volume = None,
-    matcher: Matcher = None,
-    reach: Reach = None,
+    fit_shape: FitShape = False,
+    cameras: StereoOptions,
+    views: DepthOptions,
     seen: Seen = None,
-    locked: Locked = None,
-    joints: Joints = None,
-    joint_std: JointStd = None,
-    keypoints: Keypoints = None,
-    keypoint_std: KeypointStd = None,
+    known: KnownOptions,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
-    prediction: Annotated[str, typer.Option(help="Prediction of the motion: velocity, or none.")] = "velocity",
-    points: Annotated[int, typer.Option(help="Number of model points.")] = 500,
-    model_points: Annotated[
-        str, typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape.")
-    ] = "seen",
-    recovery: Annotated[
-        str, typer.Option(help="What finding a lost shape may cost: full, starts (milliseconds), or none.")
-    ] = "full",
-    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
-    parents: Parents = None,
-    package_dir: PackageDir = None,
-    free_base: FreeBase = None,
-    skin: Skin = None,
-    pictures: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame as soon as it is done (frame_0000.png).")
-    ] = None,
+    settings: TrackerOptions,
+    options: ShapeOptions,
+    pictures: Old = None,
     view: Annotated[
         bool, typer.Option("--view", help="Show each frame in the browser as soon as it is done (extra viewer).")
     ] = False,
     port: Port = 8080,
     browser: Browser = True,
-    poses: Annotated[
-        Path | None,
-        typer.Option(metavar="OUT.csv", help="Also write a table: frame, time, status, and the pose by name."),
-    ] = None,
-    bvh: Annotated[
-        Path | None, typer.Option(metavar="OUT.bvh", help="Also write the motion for animation programs (BVH).")
-    ] = None,
-    movie: Annotated[
-        str | None,
-        typer.Option(
-            metavar="OUT.gif",
-            help="The moving picture, .gif or .mp4 (needs ffmpeg); by default RESULT.gif; none for none.",
-        ),
-    ] = None,
-    gltf: Annotated[
-        Path | None, typer.Option(metavar="OUT.glb", help="The moving shape; by default RESULT.glb.")
-    ] = None,
-    no_gltf: Annotated[bool, typer.Option("--no-gltf", help="Do not write the moving shape.")] = False,
-    upright: Upright = False,
+    poses: Old = None,
+    bvh: Old = None,
+    movie: OldWord = None,
+    gltf: Old = None,
+    no_gltf: Annotated[bool, typer.Option("--no-gltf", hidden=True, help="Do not write RESULT.glb.")] = False,
     up: Up = None,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
     resume: Annotated[
@@ -160,147 +128,79 @@ def track(
 ) -> None:
     """Follow a shape through a sequence of clouds, and find it where it is not known or was lost.
 
-    A frame that cannot be read, or with points that are not finite under --nan-policy raise, is told and dropped: its
-    pose is predicted. After Ctrl-C the results so far are on disk, and the same command with --resume goes on to the
-    same end, also with more frames than before.
+    A frame that cannot be read, or with points that are not finite under --nan-policy raise, is reported and dropped:
+    its pose is predicted. After Ctrl-C the results so far are on disk, and the same command with --resume goes on to
+    the same end, also with more frames than before. `torchreg export` writes poses, BVH, movies and pictures of frames.
 
     With --stereo LEFT RIGHT --calibration FILE clouds are the corners that both cameras see. For every frame two
     pictures go to RESULT_seen: the disparity, and the left picture with its points, blue where they are inliers, and
     the outline of the shape.
 
-    With --depth --intrinsics FILE frames are depth pictures, and what they say of free space counts too. Keypoints that
-    a detector saw, --keypoints, count beside any frames.
+    With --depth --intrinsics FILE frames are depth pictures, and their free space counts too. Keypoints that a detector
+    found, --keypoints, count with any frames.
 
-    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data, or an output beside the
-    result could not be written; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data, or an output other than
+    the result could not be written; 2 for an error; 130 for Ctrl-C.
     """
-    files, resumed = _files(output, movie, gltf, no_gltf, pictures, resume, force)
-    poses, bvh = with_ending(poses, (".csv",)), with_ending(bvh, (".bvh",))
-    check_outputs([poses, bvh], force or resumed)
-    _check_rates(fps, scale)
-    views = {"--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
-    check_used(stereo, "--stereo", {"--calibration": calibration, **views})
-    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask})
-    check_used(stereo or depth, "--stereo or --depth", {"--depth-range": depth_range})
-    options = parents, package_dir, free_base, skin
-    videos = images = folder = None
-    if stereo:
-        model = load_shape(shape, *options)
-        videos = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach, scale)
-        clouds, folder = Clouds(videos, floating=False), seen_folder(seen, files.result, force or resumed)
-    elif depth:
-        images = depth_source(frames, intrinsics, mask, depth_range)
-        clouds, model = Clouds(images), load_shape(shape, *options)
-    else:
-        clouds, model = _clouds(frames, scale, nan_policy), load_shape(shape, *options)
-
-    from torchreg.geometry.upright import guess_up
+    result = with_ending(output, (".safetensors",), add=True)
+    from torchreg._checks import check_positive
     from torchreg.storage import load_pose
-    from torchreg.tracking.tracker import TrackConfig, Tracker
+    from torchreg.tracking.tracker import Tracker
 
-    known_direction = known_up(up, frames, camera=stereo or depth)
-    config = TrackConfig(
-        model_points=model_points,
-        num_model_points=points,
-        prediction=prediction,
-        recovery=recovery,
-        seed=seed,
-        upright=(known_direction or guess_up([clouds[0]])) if upright else None,
-    )
+    files = _files(result, movie, gltf, no_gltf, pictures, poses, bvh, f" --data {frames[0]}")
+    resumed = files.check(force, resume)
+    check_positive(fps, "--fps")
+    check_positive(scale, "--scale")
+    cameras.check(seen, views)
+    model = options.load(shape)
+    if cameras.stereo:
+        source: Any = cameras.source(frames, model, views.depth_range, scale)
+        folder = seen_folder(seen, result, force or resumed)
+    else:
+        source = views.frames(frames, scale, nan_policy)
+    clouds = Clouds(source, floating=not cameras.stereo)
+    direction = known_up(up, frames, camera=cameras.stereo or views.depth)
+    config = settings.config(direction, clouds)
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
     network = read_initializer(initializer, model)
-    known = read_known(model, locked, joints, joint_std, len(clouds))
-    measured = read_keypoints(keypoints, keypoint_std, clouds, model, images)
-    job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job() | measured.job()
-    job |= {} if initializer is None else {"--initializer": str(initializer)}
-    job |= {"--fit-shape": True} if fit_shape else {}
-    if fit_shape and not model.coefficient_names:
-        model = model.with_bone_coefficients()
-    with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
-        tracker = Tracker(
-            model, first, config=config, locked=known.locked, initializer=network, fit_shape=fit_shape
-        )  # fmt: skip
-        run = TrackRun(
-            tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=Report(bar, clouds, quiet),
-            save_every=save_every, known=known, measured=measured, up=known_direction,
-        )  # fmt: skip
-        _add_pictures(run, videos, folder, images)
+    given = known.read(model, clouds, source if views.depth else None)
+    job = {
+        "shape": shape, "shape options": [None if value is None else str(value) for value in astuple(options)],
+        "--start": None if first is None else first.tolist(), **settings.job(config), "--fps": fps, "--scale": scale,
+        "--nan-policy": nan_policy, "frames": list(clouds.names), **given.job(), **cameras.job(source),
+        **views.job(source), **({} if initializer is None else {"--initializer": str(initializer)}),
+        **({"--fit-shape": True} if fit_shape else {}),
+    }  # fmt: skip
+    model = fitted_shape(model, fit_shape)
+    with claimed(result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
+        tracker = Tracker(model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape)
+        run = TrackRun(tracker, clouds, fps, job, files, Report(bar, clouds, quiet), save_every, given, direction)
+        if cameras.stereo:
+            run.seen = _drawn_pictures(source, folder)
         if view:
-            run.live = _live_page(pages, port, browser, quiet, run.up)
-        complete = _run(run, bar, resumed)
-    if poses is not None:
-        with OptionalOutput(poses):
-            _write_poses(poses, model, run.located)
-    if bvh is not None:
-        with OptionalOutput(bvh):
-            _write_motion(bvh, run)
+            run.live = _live_page(pages, port, browser, quiet, direction)
+        complete = run.run(resumed)
     _report_end(run, model, complete, quiet)
 
 
-def _check_rates(fps: float, scale: float) -> None:
-    from torchreg._checks import check_positive
-
-    check_positive(fps, "--fps")
-    check_positive(scale, "--scale")
-
-
-def _add_pictures(
-    run: TrackRun, pictures: StereoFrames | None, folder: Path | None, images: DepthFrames | None
-) -> None:
-    """Tell a run which pictures its clouds come from: progress belongs to them, and what two cameras see is drawn."""
-    if pictures is not None and folder is not None:
-        run.job |= stereo_job(pictures)
-        run.seen = _drawn_pictures(pictures, folder)
-    if images is not None:
-        run.job |= depth_job(images)
-
-
-def _write_poses(path: Path, shape: ArticulatedShape, result: TrackResult) -> None:
-    """Write one row per frame; frames without a pose have no numbers."""
-    from torchreg.io.pose_table import save_pose_table
-
-    rows = [
-        [frame, time, status.value, *(value if value == value else "" for value in pose)]  # NaN is not equal to itself
-        for frame, (time, status, pose) in enumerate(
-            zip(result.times.tolist(), result.statuses, result.poses.tolist(), strict=True)
-        )
-    ]
-    save_pose_table(path, ["frame", "time", "status", *shape.dof_names], rows)
-
-
-def _write_motion(path: Path, run: TrackRun) -> None:
-    """Write the motion of the shape, unless it was never found."""
-    from torchreg.geometry.upright import guess_up
-    from torchreg.viz.track_bvh import save_track_bvh
-
-    if bool(run.result.poses.isfinite().all(-1).any()):
-        save_track_bvh(path, run.tracker.shape, run.result, up=run.up or guess_up(list(run.result.keypoints)))
-        tell_origin(path, run.clouds.origin)
-
-
 def _files(
-    output: Path, movie: str | None, gltf: Path | None, no_gltf: bool, pictures: Path | None, resume: bool, force: bool
-) -> tuple[TrackFiles, bool]:
-    """Return the outputs, after a check that they are writable, and whether an earlier run is resumed."""
+    result: Path, movie: str | None, gltf: Path | None, no_gltf: bool, pictures: Path | None, poses: Path | None,
+    bvh: Path | None, measured: str,
+) -> TrackFiles:  # fmt: skip
+    """Return where the outputs go; the moving picture and the moving shape by default to the name of the result."""
     from torchreg._checks import check_choice
 
-    if movie is not None and Path(movie).suffix.lower() not in (".gif", ".mp4"):
-        check_choice(movie, "--movie", MOVIES)
     if gltf is not None and no_gltf:
         raise InputError("--gltf and --no-gltf cannot be used together; leave out either")
-    result = with_ending(output, (".safetensors",), add=True)
-    scene = None if no_gltf else with_ending(gltf, (".glb",)) or result.with_suffix(".glb")
-    files = TrackFiles.at(result, movie or "gif", scene, pictures)
-    resumed = resume and files.progress.exists()
-    files.check(force or resumed)
-    return files, resumed
-
-
-def _clouds(frames: list[Path], scale: float, nan_policy: str) -> Clouds:
-    from torchreg.io.frames import load_frames
-
-    sequence = load_frames(cloud_files(frames), scale=scale, nan_policy=nan_policy)
-    return Clouds(sequence)
+    moving = Path(movie or "")
+    if moving.suffix.lower() not in MOVIES:
+        check_choice(movie or "gif", "--movie", ("gif", "mp4", "none"))
+        moving = result.with_suffix(f".{movie or 'gif'}")
+    drawn = None if movie == "none" else moving
+    check_old({"--poses": (poses, ".csv"), "--bvh": (bvh, ".bvh"), "--gltf": (gltf, ".glb")}, result)
+    check_old({"--movie": (movie and drawn, ""), "--pictures": (pictures, "")}, result, measured)
+    scene = None if no_gltf else gltf or result.with_suffix(".glb")
+    return TrackFiles(result, drawn, scene, pictures, poses, bvh)
 
 
 def _progress_bar(count: int, quiet: bool) -> Any:
@@ -309,7 +209,7 @@ def _progress_bar(count: int, quiet: bool) -> Any:
     return tqdm(total=count, unit="frame", desc="tracking", leave=False, disable=quiet)
 
 
-def _drawn_pictures(frames: StereoFrames, folder: Path) -> Callable[[LinearBlendSkin], OnFrame]:
+def _drawn_pictures(frames: Any, folder: Path) -> Callable[[LinearBlendSkin], OnFrame]:
     """Return the function that draws the frames of stereo pictures into a folder, with a skin's outline."""
     from torchreg.viz.seen import StereoPictures
 
@@ -334,26 +234,13 @@ def _live_page(
 
 
 def _report_end(run: TrackRun, model: ArticulatedShape, complete: bool, quiet: bool) -> None:
-    """Print the summary of a run; raise its exit unless it is complete and usable."""
+    """Write tables and print the summary of a run; raise its exit unless it is complete and usable."""
+    run.write([run.files.poses, run.files.bvh])
     statuses = run.result.statuses
     if not quiet:
-        told = "; ".join(filter(None, (summary(run.result), person_summary(model, run.result))))
-        typer.echo(f"{told} -> {run.files.result}")
+        words = filter(None, (summary(run.result), person_summary(model, run.result)))
+        typer.echo(f"{'; '.join(words)} -> {run.files.result}")
     if not complete:
         raise interruption(f"{len(statuses)} of {len(run.clouds)} frames are done; --resume goes on from there")
     if not all(status.usable for status in statuses):
         raise typer.Exit(ExitCode.UNUSABLE)
-
-
-def _run(run: TrackRun, bar: Any, resumed: bool) -> bool:
-    """Track all frames, write what belongs to a complete run, and return whether it is complete."""
-    from torchreg.cli.track_checkpoint import load_progress
-
-    if resumed:
-        run.go_on(load_progress(run.files.progress))
-    complete = run.run()
-    if complete:
-        bar.reset(len(run.clouds))
-        bar.set_description("drawing")
-        run.write(on_frame=lambda done, planned: bar.update())
-    return complete

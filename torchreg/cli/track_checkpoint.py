@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg.errors import FormatError, InputError
+from torchreg.errors import FormatError
 from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
@@ -31,14 +31,7 @@ _NOT_BY_FRAME = {"origin", "shape", "up", "coefficients", "coefficient_covarianc
 
 @dataclass(frozen=True)
 class TrackProgress:
-    """A run of a tracker up to some frame.
-
-    Args:
-        result: of the T frames done.
-        state: of the tracker after them.
-        job: what it was told to do, as plain data: str, bool, int, float, None, lists and dicts of them.
-        contents: digests of the frames done.
-    """
+    """Results and state of a tracker up to some frame, what it was to do as plain data, and digests of the frames."""
 
     result: TrackResult
     state: TrackState
@@ -47,16 +40,7 @@ class TrackProgress:
 
 
 def save_progress(path: str | os.PathLike[str], progress: TrackProgress) -> None:
-    """Write a run to one file, whole or not at all; `load_progress` reads it back to the last bit.
-
-    Args:
-        path: a local file; an existing one is replaced.
-        progress: the run.
-
-    Raises:
-        FormatError: if the path is an address.
-        FileNotFoundError: if the folder does not exist.
-    """
+    """Write a run to one file, whole or not at all; `load_progress` reads it back to the last bit."""
     place = local_path(path)
     content = io.BytesIO()
     with tempfile.TemporaryDirectory() as name:
@@ -72,16 +56,7 @@ def save_progress(path: str | os.PathLike[str], progress: TrackProgress) -> None
 
 
 def load_progress(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> TrackProgress:
-    """Return the run that `save_progress` wrote.
-
-    Args:
-        path: the file.
-        limits: on its size, packed and unpacked.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FormatError: if it is damaged or something else; names the file.
-    """
+    """Return the run that `save_progress` wrote; FormatError, which names the file, if it is damaged."""
     place = local_path(path)
     content = read_bytes(place, limits)
     try:
@@ -104,29 +79,14 @@ def load_progress(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
 
 
 def first_frames(result: TrackResult, count: int) -> TrackResult:
-    """Return the first frames of a tracked sequence.
-
-    Raises:
-        InputError: if there are fewer.
-    """
-    if not 0 <= count <= len(result.statuses):
-        raise InputError(f"count must be from 0 to {len(result.statuses)}, got {count}")
+    """Return the first frames of a tracked sequence."""
     values = {item.name: getattr(result, item.name) for item in fields(result)}
     cut = {name: value[:count] for name, value in values.items() if name not in _NOT_BY_FRAME}
     return replace(result, **cut)
 
 
 def join_frames(first: TrackResult, second: TrackResult) -> TrackResult:
-    """Return two parts of a tracked sequence as one.
-
-    Raises:
-        InputError: if they are of different shapes.
-    """
-    if first.poses.shape[1:] != second.poses.shape[1:] or first.keypoints.shape[1:] != second.keypoints.shape[1:]:
-        raise InputError(
-            f"second must be of the same shape as first, with {first.poses.shape[-1]} degrees of freedom and "
-            f"{first.keypoints.shape[-2]} keypoints, got {second.poses.shape[-1]} and {second.keypoints.shape[-2]}"
-        )
+    """Return two parts of a tracked sequence of one shape as one."""
 
     def joined(one: Any, other: Any) -> Any:
         return torch.cat([one, other]) if isinstance(one, Tensor) else one + other

@@ -1,23 +1,23 @@
-"""What ``torchreg track`` does: frames one after another, how far it got kept on disk, what is told and written."""
+"""What ``torchreg track`` does: frames one after another, progress on disk, reports, outputs."""
 
 from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from torchreg.cli.keypoint_options import MeasuredFrames
 from torchreg.cli.known_options import Known
-from torchreg.cli.outputs import check_outputs, tell_origin
+from torchreg.cli.outputs import check_outputs
 from torchreg.cli.reporting import OptionalOutput, show_warning
 from torchreg.cli.upright import remembering
+from torchreg.cli.writers import Source, write_optional
 from torchreg.errors import FormatError, InputError, UnitsWarning
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from torchreg.io.frames import Frames
     from torchreg.shapes.skin import LinearBlendSkin
     from torchreg.tracking.results import FrameResult, TrackResult, TrackState
-    from torchreg.tracking.tracker import TrackConfig, Tracker
+    from torchreg.tracking.tracker import Tracker
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 
@@ -42,46 +42,38 @@ class TrackFiles:
     """Where the outputs go."""
 
     result: Path
-    progress: Path
     movie: Path | None
     gltf: Path | None
     pictures: Path | None
+    poses: Path | None
+    bvh: Path | None
 
-    @classmethod
-    def at(cls, result: Path, movie: str, gltf: Path | None, pictures: Path | None) -> TrackFiles:
-        """Return them for a result, and what else is asked for."""
-        named = Path(movie).suffix.lower() in (".gif", ".mp4")
-        moving = Path(movie) if named else None if movie == "none" else result.with_suffix(f".{movie}")
-        return cls(result, result.with_suffix(".progress"), moving, gltf, pictures)
+    @property
+    def progress(self) -> Path:
+        """The file that keeps how far a run got."""
+        return self.result.with_suffix(".progress")
 
     def frame(self, number: int) -> Path:
         """Return where the picture of a frame goes."""
         return (self.pictures or Path()) / f"frame_{number:04d}.png"
 
-    def check(self, force: bool) -> None:
-        """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
+    def check(self, force: bool, resume: bool) -> bool:
+        """Return whether an earlier run is resumed; raise if an output cannot be written or may not be overwritten."""
+        resumed = resume and self.progress.exists()
+        force = force or resumed
         if self.progress.exists() and not force:
             raise InputError(f"{self.progress} is how far an earlier run got; pass --resume to go on, or --force")
-        check_outputs([self.result, self.result.with_suffix(".json"), self.movie, self.gltf, self.progress], force)
-        if self.movie is not None and self.movie.suffix == ".mp4":
-            from torchreg.viz.animation import check_animation_path
-
-            check_animation_path(self.movie)
+        others = self.result.with_suffix(".json"), self.movie, self.gltf, self.progress, self.poses, self.bvh
+        check_outputs([self.result, *others], force)
         if self.pictures is not None:
             if self.pictures.is_dir():
                 check_outputs([next(self.pictures.glob("frame_*.png"), None)], force)
             self.pictures.mkdir(exist_ok=True)
+        return resumed
 
 
 class Clouds(Sequence["Tensor"]):
-    """The clouds (M, 3) in metres; those that cannot be read have no points.
-
-    Coordinates far from the origin, as in maps, begin at one near the first cloud: see `origin`.
-
-    Args:
-        frames: the sequence.
-        floating: whether an origin may be chosen.
-    """
+    """The clouds (M, 3) in metres, empty where they cannot be read; far from zero they begin at `origin`."""
 
     def __init__(self, frames: Frames | StereoFrames | DepthFrames, floating: bool = True) -> None:
         self.names, self._frames, self._floating = frames.names, frames, floating
@@ -132,28 +124,9 @@ class Clouds(Sequence["Tensor"]):
         return None
 
 
-def track_job(
-    shape: str, options: tuple[Any, ...], start: Tensor | None, config: TrackConfig, fps: float, scale: float,
-    nan_policy: str, clouds: Clouds,
-) -> dict[str, Any]:  # fmt: skip
-    """Return all that decides about the poses, as plain data: what JSON gives back is equal to it."""
-    configuration = asdict(config) | {"upright": None if config.upright is None else list(config.upright)}
-    return {
-        "shape": shape, "shape options": [None if value is None else str(value) for value in options],
-        "--start": None if start is None else start.tolist(), "configuration": configuration, "--fps": fps,
-        "--scale": scale, "--nan-policy": nan_policy, "frames": list(clouds.names),
-    }  # fmt: skip
-
-
 @dataclass
 class Report:
-    """Tells how a run goes on.
-
-    Args:
-        bar: of tqdm.
-        clouds: the frames.
-        quiet: whether only what went wrong with files is told.
-    """
+    """Prints how a run goes on, if ``quiet`` only what went wrong with files."""
 
     bar: Any
     clouds: Clouds
@@ -173,13 +146,13 @@ class Report:
         self.usable = status.usable
 
     def dropped(self, number: int, reason: str) -> None:
-        """Tell that a frame cannot be read."""
+        """Print that a frame cannot be read."""
         self.bar.clear()
         typer.echo(f"torchreg: warning: frame {number} is dropped: {reason}", err=True)
 
     @contextmanager
     def warnings(self) -> Iterator[None]:
-        """Tell the first warning of other units only: all frames have the same."""
+        """Print the first warning of other units only: all frames have the same."""
 
         def show(
             message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
@@ -200,20 +173,11 @@ class TrackRun:
     """Tracks frame after frame, and keeps on disk how far it got.
 
     Args:
-        tracker: of the shape.
-        clouds: the frames.
-        fps: frames per second.
-        job: what decides about the poses.
-        files: where outputs go.
-        report: tells how it goes on.
+        job: all that decides about the poses, as plain data.
         save_every: frames between two writings.
-        seen: draws what the cameras saw of a frame, or None.
-        live: shows a frame in the browser, or None.
-        known: what is known of the poses.
-        measured: keypoints of the frames.
-        up: the upright direction, where it is known.
+        seen: draws what the cameras saw of a frame.
+        live: shows a frame in the browser.
         parts: results of the frames done.
-        state: after them.
     """
 
     tracker: Tracker
@@ -223,11 +187,10 @@ class TrackRun:
     files: TrackFiles
     report: Report
     save_every: int
+    known: Known
+    up: Direction | None
     seen: Callable[[LinearBlendSkin], OnFrame] | None = None
     live: Callable[[LinearBlendSkin], OnFrame] | None = None
-    known: Known = field(default_factory=Known.nothing)
-    measured: MeasuredFrames = field(default_factory=MeasuredFrames)
-    up: Direction | None = None
     parts: list[TrackResult] = field(default_factory=list)
     state: TrackState = field(init=False)
 
@@ -279,10 +242,12 @@ class TrackRun:
         self.report.usable = progress.result.statuses[-1].usable
         self.report.bar.update(done)
 
-    def run(self) -> bool:
-        """Track what is left, and return whether all is done; what is done is on disk."""
-        from torchreg.cli.track_checkpoint import TrackProgress, save_progress
+    def run(self, resumed: bool) -> bool:
+        """Track all frames, write what belongs to a complete run, and return whether it is; what is done is on disk."""
+        from torchreg.cli.track_checkpoint import TrackProgress, load_progress, save_progress
 
+        if resumed:
+            self.go_on(load_progress(self.files.progress))
         self.clouds.on_drop = self.report.dropped
         complete = True
         while complete and self.state.frame < len(self.clouds):
@@ -295,6 +260,10 @@ class TrackRun:
                 save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
         self.clouds.on_drop = None
         remembering(self.located, self.up).save(self.files.result)
+        if complete:
+            self.report.bar.reset(len(self.clouds))
+            self.report.bar.set_description("drawing")
+            self.write([self.files.gltf, self.files.movie])
         return complete
 
     def _part(self, numbers: range) -> None:
@@ -311,11 +280,9 @@ class TrackRun:
             self.state = self.tracker.state
 
         times = [number / self.fps for number in numbers]
-        told = [self.known.prior(number, self.clouds.origin) for number in numbers]
         try:
             frames = (self.clouds.frame(number) for number in numbers)
-            told_of = self.measured.part(numbers, self.clouds.origin)
-            result = self.tracker.run(frames, note, times=times, priors=told if any(told) else None, **told_of)
+            result = self.tracker.run(frames, note, times=times, **self.known.part(numbers, self.clouds.origin))
         except KeyboardInterrupt:
             if not self.parts:
                 raise
@@ -342,23 +309,14 @@ class TrackRun:
         overlays = FrameOverlays(self.tracker.shape, surface, up=self.up)
         return lambda points, frame: overlays.save(self.files.frame(frame.frame), points, frame)
 
-    def write(self, on_frame: Callable[[int, int], None]) -> None:
-        """Write the moving shape and the moving picture, where asked for."""
-        from torchreg.geometry.upright import guess_up
-        from torchreg.viz.tracking import animate_track, save_track_gltf
-
-        result, shape = self.result, self.tracker.shape
-        if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
-            with OptionalOutput(self.files.gltf):
-                up = self.up or guess_up(list(result.keypoints))
-                save_track_gltf(self.files.gltf, shape, result, up=up)
-                tell_origin(self.files.gltf, self.clouds.origin)
-        if self.files.movie is not None:
-            with OptionalOutput(self.files.movie):
-                animate_track(
-                    self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, up=self.up,
-                    on_frame=on_frame,
-                )  # fmt: skip
+    def write(self, paths: Iterable[Path | None]) -> None:
+        """Write files of what is done, but no motion of a shape that was never found."""
+        found = bool(self.result.poses.isfinite().all(-1).any())
+        source = Source(
+            [self.located], self.clouds, self.tracker.shape, up=self.up, fps=self.fps, local=self.result,
+            coarse=lambda: self.surface, on_frame=lambda done, planned: self.report.bar.update(),
+        )  # fmt: skip
+        write_optional([path for path in paths if path and (found or path.suffix not in (".glb", ".bvh"))], source)
 
 
 def summary(result: TrackResult) -> str:

@@ -9,7 +9,7 @@ import typer
 
 from torchreg.cli.outputs import Quiet, with_ending
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
+from torchreg.cli.shape_argument import Shape, ShapeOptions
 
 if TYPE_CHECKING:
     from torchreg.alignment.train_initializer import TrainingRow
@@ -24,28 +24,26 @@ def train_initializer(
             "--output", "-o", metavar="OUT.safetensors", help="The weights; beside it a checkpoint and a curve."
         ),
     ] = Path("initializer.safetensors"),
+    *,
     minutes: Annotated[float, typer.Option(help="Of training; again with more to go on where it ended.")] = 30.0,
     batch: Annotated[int, typer.Option(help="Made-up clouds per step; 512 on a GPU.")] = 64,
     seed: Annotated[int, typer.Option(help="Of the network and of the clouds.")] = 0,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    parents: Parents = None,
-    package_dir: PackageDir = None,
-    free_base: FreeBase = None,
-    skin: Skin = None,
+    options: ShapeOptions,
     quiet: Quiet = False,
 ) -> None:
     """Train a network that proposes poses of a shape, on made-up clouds of it; again to go on."""
     from torchreg.alignment.train_initializer import TrainInitializerConfig, train_initializer
 
     path = with_ending(output, (".safetensors",), add=True)
-    model = load_shape(shape, parents, package_dir, free_base, skin).to(device)
+    model = options.load(shape).to(device)
     config = TrainInitializerConfig(minutes=minutes, batch=batch, seed=seed)
-    train_initializer(model, path, config, progress=None if quiet else _tell)
+    train_initializer(model, path, config, progress=None if quiet else _show)
     if not quiet:
         typer.echo(f"wrote {path}")
 
 
-def _tell(row: TrainingRow) -> None:
+def _show(row: TrainingRow) -> None:
     typer.echo(
         f"step {row.step}  {row.seconds / 60:.1f} min  loss {row.loss:.3f}  of clouds not trained on: error "
         f"{row.error:.1%} of the size, {row.near:.0%} within 5 %"

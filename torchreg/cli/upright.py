@@ -46,13 +46,7 @@ def check_up(up: str | None) -> Direction | None:
 
 
 def known_up(up: str | None, files: Sequence[Path | str], *, camera: bool = False) -> Direction | None:
-    """Return what --up says, else what the format of files or folders does; None where points are to tell.
-
-    Args:
-        up: the option.
-        files: that are read, or folders of them.
-        camera: whether files are pictures of cameras.
-    """
+    """Return what --up says, else a camera's or the format of files or folders; None where points decide."""
     from torchreg.geometry.upright import Y_UP_ENDINGS
 
     if up is not None or camera:

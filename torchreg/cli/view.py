@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import Scale, cloud_files
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, result_file, with_ending
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import HANDS, PEOPLE, FreeBase, PackageDir, Parents, Skin, load_shape, near_shape
-from torchreg.cli.upright import Up, known_up
+from torchreg.cli.shape_argument import HANDS, PEOPLE, ShapeOptions, near_shape
+from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def view(
             ".gltf), a scan or cloud of any format that `torchreg formats` shows, or a folder of them.",
         ),
     ],
+    *,
     shape: Annotated[
         str | None,
         typer.Option(
@@ -64,10 +65,7 @@ def view(
     browser: Browser = True,
     up: Up = None,
     scale: Scale = 1.0,
-    parents: Parents = None,
-    package_dir: PackageDir = None,
-    free_base: FreeBase = None,
-    skin: Skin = None,
+    options: ShapeOptions,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -82,7 +80,7 @@ def view(
     html, rerun = with_ending(html, (".html",)), with_ending(rerun, (".rrd",))
     check_outputs([html, rerun], force)
     up_direction = known_up(up, [] if is_result(result) else [result, *(data or [])])
-    if shape is None and is_result(result) and (parents or package_dir or skin or free_base is not None):
+    if shape is None and is_result(result) and options.given():
         raise InputError("--parents, --package-dir, --skin and --free-base are about a --shape, which was not given")
     from torchreg.storage import load
     from torchreg.viz.rerun_log import import_rerun, scene_rrd
@@ -94,13 +92,9 @@ def view(
         import_rerun()
     if rerun is None or html is not None:
         import_viser()
-    found: Any
-    if is_result(result):
-        found = load(result if result.suffix else result.with_suffix(".safetensors"))
-    else:
-        found = _shown(result, scale, parents, package_dir, free_base, skin)
-    model = None if shape is None else load_shape(shape, parents, package_dir, free_base, skin)
-    scene = with_up(result_scene(found, shape=model, data=_read(data or [], scale)), up_direction)
+    found = load(result_file(result)) if is_result(result) else _shown(result, scale, options)
+    model = None if shape is None else options.load(shape)
+    scene = remembering(result_scene(found, shape=model, data=read_frames(data or [], scale)), up_direction)
     if rerun is not None:
         scene_rrd(rerun, scene)
     if html is not None:
@@ -119,39 +113,25 @@ def is_result(name: Path) -> bool:
     return not name.exists() and name.with_suffix(".safetensors").exists()
 
 
-def _shown(
-    name: Path,
-    scale: float,
-    parents: Path | None,
-    package_dir: list[Path] | None,
-    free_base: bool | None,
-    skin: str | None,
-) -> Any:
+def _shown(name: Path, scale: float, options: ShapeOptions) -> Any:
     """Return a shape, mesh or cloud by name or file, or the meshes or clouds of a folder."""
     from torchreg.errors import FormatError, ModelError
     from torchreg.io.points import load_points
 
     ending = name.suffix.lower()
     if name.is_dir() or ending == ".npz":
-        return _read([name], scale)
+        return read_frames([name], scale)
     if str(name) in HANDS or str(name) in PEOPLE or ending == ".urdf":
-        return load_shape(str(name), parents, package_dir, free_base, skin)
+        return options.load(str(name))
     if ending in (".glb", ".gltf"):
         try:
-            return load_shape(str(name), parents, package_dir, free_base, skin)
+            return options.load(str(name))
         except (FormatError, ModelError):  # no rig, but maybe a mesh
-            if parents is not None or skin is not None:
+            if options.parents is not None or options.skin is not None:
                 raise
     if not name.exists() and not ending:
         raise InputError(f"there is no result {name}.safetensors, and no file {name}; {near_shape(str(name))}")
     return load_points(name, scale=scale)
-
-
-def with_up(scene: Scene, up: tuple[float, float, float] | None) -> Scene:
-    """Return a scene with an upright direction, if one is given."""
-    from dataclasses import replace
-
-    return scene if up is None else replace(scene, up=up)
 
 
 def tell_url(url: str, browser: bool, quiet: bool) -> None:
@@ -181,7 +161,7 @@ def _serve(scene: Scene, port: int, browser: bool, quiet: bool) -> None:
         wait_for_interrupt(viewer.url, browser, quiet)
 
 
-def _read(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
+def read_frames(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
     """Return the meshes or clouds of files, or the frames of a folder or one .npz, in their order."""
     from torchreg.io.frames import load_frames
 
