@@ -1,5 +1,6 @@
 """Small files made by hand: put on disk, read back, and refused in one table."""
 
+import base64
 import json
 import struct
 from typing import Any
@@ -128,6 +129,27 @@ class Scene:
         if above is not None:
             self.node(root=True, children=[base, body], **above)
         return number
+
+    def clip(self, times, tracks, **sampler):
+        """Add an animation: keys by (node, path)."""
+        moments, samplers, channels = self.add(np.asarray(times, "f4")), [], []
+        for (node, path), keys in tracks.items():
+            channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
+            samplers.append({"input": moments, "output": self.add(np.asarray(keys, "f4")), **sampler})
+        self.append("animations", {"samplers": samplers, "channels": channels})
+
+    def change(self, path, value):
+        """Set the entry at a dotted path."""
+        place: Any = self.json
+        *keys, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+        for key in keys:
+            place = place[key]
+        place[last] = value
+
+    def text(self):
+        """Return the document with its buffer as text."""
+        uri = "data:application/octet-stream;base64," + base64.b64encode(self.blob).decode()
+        return json.dumps(self.json | {"buffers": [{"byteLength": len(self.blob), "uri": uri}]})
 
     def content(self):
         return glb({"buffers": [{"byteLength": len(self.blob)}]} | self.json, self.blob)
