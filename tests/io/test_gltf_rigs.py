@@ -1,12 +1,8 @@
-"""Rigs from glTF: round trips, hand-made documents, flat hierarchies, and everything that is refused."""
+"""Rigs from glTF: round trips, documents made by hand, pieces that are bad, flat hierarchies, and what is refused."""
 
-import base64
-import copy
-import json
 import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,95 +11,42 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchreg.errors import FileWarning, FormatError, ModelError
+import torchreg as tr
+from tests.io.helpers import FACES, UPPER, Scene, put, refused, shift
 from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 
-KINDS = {"i1": 5120, "u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+FileWarning, FormatError, ModelError = tr.errors.FileWarning, tr.errors.FormatError, tr.errors.ModelError
 HAND = Path(__file__).resolve().parents[3] / "shared" / "data" / "webxr_hand_right.glb"
-
-POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype="f4")
-JOINTS = np.array([[0, 1, 0, 0]] * 4, dtype="u1")
-WEIGHTS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0, 0], [0.25, 0.75, 0, 0], [0, 1, 0, 0]], dtype="f4")
-FACES = np.array([0, 1, 2, 1, 3, 2], dtype="u2")
-INVERSE_BIND = np.tile(np.eye(4, dtype="f4"), (2, 1, 1))
-INVERSE_BIND[1, 0, 3] = -1.0  # the second joint sits at x = 1
-
-
-class Builder:
-    """A glTF document made by hand, independent of the writer."""
-
-    def __init__(self) -> None:
-        self.blob = b""
-        self.json: dict[str, Any] = {
-            "asset": {"version": "2.0"},
-            "accessors": [],
-            "bufferViews": [],
-            "buffers": [],
-            "nodes": [
-                {"name": "mesh", "mesh": 0, "skin": 0},
-                {"name": "root", "children": [2]},
-                {"name": "tip", "translation": [1, 0, 0]},
-            ],
-            "skins": [{"name": "rig", "joints": [1, 2]}],
-            "meshes": [{"name": "body", "primitives": []}],
-        }
-
-    def add(self, values: np.ndarray, normalized: bool = False, stride: int = 0) -> int:
-        width = 1 if values.ndim == 1 else values.shape[1]
-        rows = values.reshape(len(values), width)
-        data = b"".join(row.tobytes().ljust(stride, b"\xee") for row in rows)
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(data)}
-        if stride:
-            view["byteStride"] = stride
-        self.json["bufferViews"].append(view)
-        self.json["accessors"].append(
-            {
-                "bufferView": len(self.json["bufferViews"]) - 1,
-                "componentType": KINDS[values.dtype.str[1:]],
-                "count": len(values),
-                "type": TYPES[width],
-                "normalized": normalized,
-            }
-        )
-        self.blob += data.ljust(-(-len(data) // 4) * 4, b"\0")
-        return len(self.json["accessors"]) - 1
-
-    def matrices(self, matrices: np.ndarray) -> int:
-        return self.add(np.ascontiguousarray(matrices.transpose(0, 2, 1)).reshape(-1, 16).astype("f4"))
-
-    def primitive(self, indices: np.ndarray | None = FACES, mode: int = 4, **attributes: int) -> dict[str, Any]:
-        primitive: dict[str, Any] = {"attributes": attributes, "mode": mode}
-        if indices is not None:
-            primitive["indices"] = self.add(indices)
-        self.json["meshes"][0]["primitives"].append(primitive)
-        return primitive
-
-    def skinned(self, indices: np.ndarray | None = FACES, mode: int = 4) -> "Builder":
-        """Fill in the usual two-joint strip."""
-        self.primitive(indices, mode, POSITION=self.add(POINTS), JOINTS_0=self.add(JOINTS), WEIGHTS_0=self.add(WEIGHTS))
-        self.json["skins"][0]["inverseBindMatrices"] = self.matrices(INVERSE_BIND)
-        return self
-
-    def glb(self, path: Path) -> Path:
-        document = copy.deepcopy(self.json)
-        document["buffers"] = document.get("buffers") or [{"byteLength": len(self.blob)}]
-        text = json.dumps(document).encode()
-        text = text.ljust(-(-len(text) // 4) * 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text
-        chunks += struct.pack("<I4s", len(self.blob), b"BIN\0") + self.blob
-        path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-        return path
-
-    def gltf(self, path: Path, uri: str | None = None) -> Path:
-        uri = uri or "data:application/octet-stream;base64," + base64.b64encode(self.blob).decode()
-        path.write_text(json.dumps(self.json | {"buffers": [{"byteLength": len(self.blob), "uri": uri}]}))
-        return path
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "f4")
+CORNERS = np.array([[0, 1, 2], [1, 3, 2]])
+TIP = np.array([0, 0.5, 0.75, 1], "f4")
+WEIGHTS = np.stack([1 - TIP, TIP], 1)
+INVERSE = np.stack([shift(0, 0, 0), shift(-1, 0, 0)])
+STRIPED = np.array([[0, 1, 0, 0]] * 4, "u1")
 
 
-def test_writer_and_reader_agree(tmp_path: Path) -> None:
+def strip(inverse=INVERSE, points=POINTS, faces=CORNERS, tip=TIP, **changes):
+    """Return a square on two joints: tip (node 0) at x = 1 on root (1), and the body (2)."""
+    scene = Scene()
+    primitive = scene.primitive(points, faces, weights=tip, **changes)
+    scene.rig([primitive], tip={"translation": [1, 0, 0]}, inverse=inverse)
+    scene.json["skins"][0]["name"] = "rig"
+    scene.json["meshes"][0]["name"] = "body"
+    return scene
+
+
+@pytest.fixture
+def scene():
+    return strip()
+
+
+def loaded(folder, scene, **options):
+    return load_rig(scene.save(folder / "rig.glb"), **options)
+
+
+def test_writer_and_reader_agree(tmp_path):
     rng = np.random.default_rng(1)
     rest = np.tile(np.eye(4), (5, 1, 1))
     rest[:, :3, :3] = Rotation.random(5, random_state=rng).as_matrix()
@@ -113,369 +56,246 @@ def test_writer_and_reader_agree(tmp_path: Path) -> None:
     faces = rng.integers(0, 40, size=(30, 3))
     names, parents = ["a", "b", "c", "d", "e"], [-1, 0, 4, -1, 1]
     arrays = [torch.from_numpy(a) for a in (vertices, faces, weights, rest, rest[None], np.zeros(1), normals)]
-    path = tmp_path / "rig.glb"
-    save_animated_skin(path, *arrays[:3], names, parents, *arrays[3:])
-    rig = load_rig(path)
+    save_animated_skin(tmp_path / "rig.glb", *arrays[:3], names, parents, *arrays[3:])
+    rig = load_rig(tmp_path / "rig.glb")
     assert (rig.joint_names, rig.parents, rig.name) == (tuple(names), tuple(parents), "skin")
-    for got, want in (
-        (rig.vertices, vertices),
-        (rig.weights, weights),
-        (rig.joint_transforms, rest),
-        (rig.rest_transforms, rest),
-        (rig.normals, normals / np.linalg.norm(normals, axis=1, keepdims=True)),
-    ):
-        assert got is not None
-        assert got.dtype == torch.float64
-        np.testing.assert_allclose(got, want, atol=2e-6)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for name, want in (("vertices", vertices), ("weights", weights), ("joint_transforms", rest), ("normals", normals)):
+        assert getattr(rig, name).dtype == torch.float64
+        np.testing.assert_allclose(getattr(rig, name), want, atol=2e-6)
+    np.testing.assert_allclose(rig.rest_transforms, rest, atol=2e-6)
     assert rig.faces.dtype == torch.int64
     assert rig.faces.tolist() == faces.tolist()
     np.testing.assert_allclose(rig.weights.sum(1), 1, atol=1e-14)
 
 
-@pytest.mark.parametrize("form", ["glb", "data", "file"])
-def test_three_ways_to_store_buffers(tmp_path: Path, form: str) -> None:
-    builder = Builder().skinned()
-    if form == "glb":
-        path = builder.glb(tmp_path / "rig.glb")
-    elif form == "data":
-        path = builder.gltf(tmp_path / "rig.gltf")
-    else:
-        (tmp_path / "my data.bin").write_bytes(builder.blob + b"trailing")
-        path = builder.gltf(tmp_path / "rig.gltf", "my%20data.bin")
-    rig = load_rig(path)
+@pytest.mark.parametrize("form", ["glb", "gltf"])
+def test_a_rig_made_by_hand(tmp_path, scene, form):
+    rig = load_rig(put(tmp_path, f"rig.{form}", scene.content() if form == "glb" else scene.text()))
     assert (rig.name, rig.joint_names, rig.parents) == ("rig", ("root", "tip"), (-1, 0))
     assert rig.joint_transforms[1, :3, 3].tolist() == [1, 0, 0]
     assert rig.vertices.tolist() == POINTS.tolist()
-    assert rig.weights.tolist() == WEIGHTS[:, :2].tolist()
-    assert rig.faces.tolist() == [[0, 1, 2], [1, 3, 2]]
+    assert rig.weights.tolist() == WEIGHTS.tolist()
+    assert rig.faces.tolist() == CORNERS.tolist()
     assert rig.normals is None
+    del scene.json["skins"][0]["inverseBindMatrices"]  # then the nodes count
+    rig = loaded(tmp_path, scene)
+    assert torch.equal(rig.joint_transforms, rig.rest_transforms)
+    assert rig.rest_transforms[1, :3, 3].tolist() == [1, 0, 0]
 
 
-def test_normalized_strided_and_second_weight_sets(tmp_path: Path) -> None:
-    builder = Builder()
-    builder.json["skins"][0]["inverseBindMatrices"] = builder.matrices(INVERSE_BIND)
-    quarter = np.array([[64, 0, 0, 0]] * 4, dtype="u1")
-    rest = np.array([[32768, 16384, 0, 0]] * 4, dtype="u2")
-    builder.primitive(
-        FACES.astype("u4"),
-        POSITION=builder.add(POINTS, stride=20),
-        NORMAL=builder.add(np.tile(np.float32([0, 0, 1]), (4, 1))),
-        JOINTS_0=builder.add(np.ones((4, 4), dtype="u2")),
-        WEIGHTS_0=builder.add(quarter, normalized=True),
-        JOINTS_1=builder.add(np.zeros((4, 4), dtype="u1")),
-        WEIGHTS_1=builder.add(rest, normalized=True),
-    )
-    rig = load_rig(builder.glb(tmp_path / "rig.glb"))
-    first = 64 / 255
-    second = 49152 / 65535
+def test_normalized_strided_and_second_weight_sets(tmp_path):
+    scene = strip(JOINTS_0=np.ones((4, 4), "u2"), WEIGHTS_0=(np.array([[64, 0, 0, 0]] * 4, "u1"), True),
+                  JOINTS_1=np.zeros((4, 4), "u1"), WEIGHTS_1=(np.array([[32768, 16384, 0, 0]] * 4, "u2"), True),
+                  NORMAL=np.tile(np.float32([0, 0, 1]), (4, 1)), POSITION=(POINTS, False, 20))  # fmt: skip
+    rig = loaded(tmp_path, scene)
+    first, second = 64 / 255, 49152 / 65535
     np.testing.assert_allclose(rig.weights[2], [second / (first + second), first / (first + second)], atol=1e-15)
     assert rig.vertices.tolist() == POINTS.tolist()
-    assert rig.normals is not None
+    assert rig.normals.tolist() == [[0, 0, 1]] * 4
 
 
-def test_sparse_accessors(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    rows, values = builder.add(np.array([3], dtype="u2")), builder.add(np.float32([[7, 8, 9]]))
-    views = [builder.json["accessors"][index]["bufferView"] for index in (rows, values)]
-    sparse = {
-        "count": 1,
-        "indices": {"bufferView": views[0], "componentType": 5123},
-        "values": {"bufferView": views[1]},
-    }
-    accessor = builder.json["accessors"][0]
-    accessor["sparse"] = sparse
-    want = POINTS.copy()
-    want[3] = [7, 8, 9]
-    assert load_rig(builder.glb(tmp_path / "rig.glb")).vertices.tolist() == want.tolist()
-    del accessor["bufferView"]
-    assert load_rig(builder.glb(tmp_path / "rig.glb")).vertices.tolist() == [[0, 0, 0]] * 3 + [[7, 8, 9]]
-    for change, message in (
-        ({"count": 5}, "5 entries"),
-        ({"indices": None}, "lacks indices"),
-        ({"indices": {"bufferView": 0, "componentType": 5126}}, "unusable type"),
-        ({"indices": {"bufferView": 2, "componentType": 5125}}, "points at element"),
-    ):
-        accessor["sparse"] = sparse | change
-        with pytest.raises(FormatError, match=message):
-            load_rig(builder.glb(tmp_path / "rig.glb"))
+@pytest.mark.parametrize("based", [True, False])
+def test_sparse_positions(tmp_path, scene, based):
+    rows, values = scene.add(np.array([3], "u2")), scene.add(np.float32([[7, 8, 9]]))
+    views = [scene.json["accessors"][index]["bufferView"] for index in (rows, values)]
+    accessor = scene.json["accessors"][0]
+    indices = {"bufferView": views[0], "componentType": 5123}
+    accessor["sparse"] = {"count": 1, "indices": indices, "values": {"bufferView": views[1]}}
+    if not based:
+        del accessor["bufferView"]
+    assert loaded(tmp_path, scene).vertices.tolist() == [*(POINTS[:3] if based else 0 * POINTS[:3]).tolist(), [7, 8, 9]]
 
 
-@pytest.mark.parametrize(
-    ("mode", "indices", "faces"),
-    [
-        (4, None, [[0, 1, 2]]),
-        (5, [0, 1, 2, 3], [[0, 1, 2], [2, 1, 3]]),
-        (6, [0, 1, 2, 3], [[0, 1, 2], [0, 2, 3]]),
-    ],
-)
-def test_triangle_modes(tmp_path: Path, mode: int, indices: list[int] | None, faces: list[list[int]]) -> None:
-    builder = Builder().skinned(None if indices is None else np.array(indices, dtype="u1"), mode)
-    if indices is None:
-        for index in range(3):
-            builder.json["accessors"][index]["count"] = 3
-    assert load_rig(builder.glb(tmp_path / "rig.glb")).faces.tolist() == faces
+@pytest.mark.parametrize(("mode", "faces"), [(5, [[0, 1, 2], [2, 1, 3]]), (6, [[0, 1, 2], [0, 2, 3]])])
+def test_triangle_modes(tmp_path, mode, faces):
+    scene = strip(faces=np.arange(4))
+    scene.json["meshes"][0]["primitives"][0]["mode"] = mode
+    assert loaded(tmp_path, scene).faces.tolist() == faces
 
 
-def test_primitives_and_meshes_are_joined(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    shared = builder.json["meshes"][0]["primitives"][0]["attributes"]
-    builder.primitive(np.array([3, 2, 1], dtype="u1"), **shared)
-    builder.primitive(np.array([0, 1], dtype="u1"), mode=1, **shared)
-    other = {"attributes": dict(shared, POSITION=builder.add(POINTS + 5)), "indices": builder.add(FACES)}
-    builder.json["meshes"].append({"name": "shoe", "primitives": [other]})
-    builder.json["nodes"].append({"mesh": 1, "skin": 0})
-    path = builder.glb(tmp_path / "rig.glb")
-    rig = load_rig(path)
+def test_primitives_meshes_and_skins_are_joined_or_chosen(tmp_path, scene):
+    shared = scene.json["meshes"][0]["primitives"][0]["attributes"]
+    for mode, corners in ((4, [3, 2, 1]), (1, [0, 1])):
+        part = {"attributes": shared, "mode": mode, "indices": scene.add(np.array(corners, "u1"))}
+        scene.json["meshes"][0]["primitives"].append(part)
+    shoe = {"attributes": dict(shared, POSITION=scene.add(POINTS + 5)), "indices": 3}
+    scene.node(root=True, mesh=scene.append("meshes", {"name": "shoe", "primitives": [shoe]}), skin=0)
+    rig = loaded(tmp_path, scene)
     assert len(rig.vertices) == 8  # vertices that two primitives share are not doubled
     assert rig.faces.tolist() == [[0, 1, 2], [1, 3, 2], [3, 2, 1], [4, 5, 6], [5, 7, 6]]
-    assert load_rig(path, mesh="shoe").vertices.tolist() == (POINTS + 5).tolist()
-    assert len(load_rig(path, mesh=0, skin="rig").faces) == 3
-    for wanted in ({"mesh": "hat"}, {"skin": 4}):
-        with pytest.raises(ModelError, match="known: 0"):
-            load_rig(path, **wanted)  # type: ignore[arg-type]
+    assert loaded(tmp_path, scene, mesh="shoe").vertices.tolist() == (POINTS + 5).tolist()
+    assert len(loaded(tmp_path, scene, mesh=0, skin="rig").faces) == 3
+    scene.node(root=True, mesh=0, skin=scene.append("skins", {"name": "second", "joints": [0, 1]}))
+    scene.append("skins", {"name": "idle", "joints": [0]})
+    both = loaded(tmp_path, scene)
+    assert (both.name, both.joint_names, len(both.vertices)) == ("rig", ("root", "tip"), 12)
+    assert loaded(tmp_path, scene, skin="second").joint_names == ("tip", "root")
+    refused(
+        (lambda: loaded(tmp_path, scene, mesh="hat"), "known: 0"),
+        (lambda: loaded(tmp_path, scene, skin=4), "known: 0"),
+        (lambda: loaded(tmp_path, scene, skin="idle"), "carries both a mesh and a skin with mesh=None, skin='idle'"),
+        error=ModelError,
+    )
 
 
-def test_one_of_several_skins_is_chosen(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    builder.json["skins"].append({"name": "second", "joints": [2, 1]})
-    builder.json["nodes"].append({"mesh": 0, "skin": 1})
-    path = builder.glb(tmp_path / "rig.glb")
-    both = load_rig(path)
-    assert (both.name, both.joint_names, len(both.vertices)) == ("rig", ("root", "tip"), 8)
-    assert load_rig(path, skin="second").joint_names == ("tip", "root")
-    builder.json["skins"].append({"name": "idle", "joints": [2]})
-    with pytest.raises(ModelError, match="no node carries both a mesh and a skin with mesh=None, skin='idle'"):
-        load_rig(builder.glb(path), skin="idle")
+def test_parents_replace_a_flat_hierarchy(tmp_path, scene):
+    scene.json["nodes"][1] = {"name": "root"}
+    scene.json["scenes"][0]["nodes"].append(0)
+    assert loaded(tmp_path, scene).parents == (-1, -1)
+    assert loaded(tmp_path, scene, parents={"tip": "root"}).parents == (-1, 0)
+    assert loaded(tmp_path, scene, parents={"root": "tip", "tip": None}).parents == (1, -1)
+    circle = {"tip": "root", "root": "tip"}
+    refused(
+        (lambda: loaded(tmp_path, scene, parents={"tip": "thumb"}), "unknown joints thumb; known: root, tip"),
+        (lambda: loaded(tmp_path, scene, parents=circle), "cyclic at joints root, tip"),
+        error=ModelError,
+    )
 
 
-def test_parents_replace_a_flat_hierarchy(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    builder.json["nodes"][1] = {"name": "root"}
-    path = builder.glb(tmp_path / "rig.glb")
-    assert load_rig(path).parents == (-1, -1)
-    assert load_rig(path, parents={"tip": "root"}).parents == (-1, 0)
-    assert load_rig(path, parents={"root": "tip", "tip": None}).parents == (1, -1)
-    with pytest.raises(ModelError, match="unknown joints thumb; known: root, tip"):
-        load_rig(path, parents={"tip": "thumb"})
-    with pytest.raises(ModelError, match="cyclic at joints root, tip"):
-        load_rig(path, parents={"tip": "root", "root": "tip"})
-
-
-def test_joints_below_other_nodes_and_without_names(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    turn = Rotation.from_rotvec([0.3, -0.4, 0.5])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec([0, 0, 1]).as_matrix(), [0, 2, 0]
-    builder.json["nodes"] += [
-        {"children": [4], "rotation": list(turn.as_quat()), "translation": [1, 2, 3], "scale": [2, 2, 2]},
-        {"children": [1], "matrix": matrix.T.reshape(-1).tolist()},
-    ]
-    builder.json["nodes"][1] = {"children": [5]}
-    builder.json["nodes"].append({"children": [2]})
-    del builder.json["nodes"][2]["name"]
-    builder.json["skins"][0]["inverseBindMatrices"] = builder.matrices(INVERSE_BIND)
-    rig = load_rig(builder.glb(tmp_path / "rig.glb"))
-    assert rig.joint_names == ("joint_0", "joint_1")
-    assert rig.parents == (-1, 0)
+def test_joints_below_other_nodes_and_without_names(tmp_path, scene):
+    turn, matrix = Rotation.from_rotvec([0.3, -0.4, 0.5]), shift(0, 2, 0)
+    matrix[:3, :3] = Rotation.from_rotvec([0, 0, 1]).as_matrix()
+    between = scene.node(matrix=matrix.T.reshape(-1).tolist(), children=[1])
+    placed = {"rotation": list(turn.as_quat()), "translation": [1, 2, 3], "scale": [2, 2, 2]}
+    above = scene.node(children=[between], **placed)
+    scene.json["nodes"][1] = {"children": [scene.node(children=[0])]}
+    del scene.json["nodes"][0]["name"]
+    scene.json["scenes"][0]["nodes"] = [above, 2]
+    rig = loaded(tmp_path, scene)
+    assert (rig.joint_names, rig.parents) == (("joint_0", "joint_1"), (-1, 0))
     rotation = turn.as_matrix() @ matrix[:3, :3]
     root = turn.as_matrix() @ (2 * matrix[:3, 3]) + [1, 2, 3]
     np.testing.assert_allclose(rig.rest_transforms[0, :3, :3], rotation, atol=1e-12)
-    np.testing.assert_allclose(rig.rest_transforms[0, :3, 3], root, atol=1e-12)
-    np.testing.assert_allclose(rig.rest_transforms[1, :3, 3], root + 2 * rotation[:, 0], atol=1e-12)
+    np.testing.assert_allclose(rig.rest_transforms[:, :3, 3], [root, root + 2 * rotation[:, 0]], atol=1e-12)
     # The skeleton shows the skin turned, moved, and twice as large as stored.
     np.testing.assert_allclose(rig.vertices, 2 * POINTS @ rotation.T + root, atol=1e-12)
     np.testing.assert_allclose(rig.joint_transforms, rig.rest_transforms, atol=1e-12)
 
 
-def test_scale_that_the_inverse_bind_undoes(tmp_path: Path) -> None:
-    builder = Builder().skinned()
+def test_scale_that_the_inverse_bind_undoes(tmp_path):
     small = np.diag([0.01, 0.01, 0.01, 1.0])
-    builder.json["nodes"].append({"children": [1], "scale": [0.01] * 3})
-    builder.json["nodes"][2]["translation"] = [100, 0, 0]
     bind = np.stack([small, small])
     bind[1, 0, 3] = 1.0
-    builder.json["skins"][0]["inverseBindMatrices"] = builder.matrices(np.linalg.inv(bind))
-    rig = load_rig(builder.glb(tmp_path / "rig.glb"))
+    scene = strip(inverse=np.linalg.inv(bind))
+    scene.json["scenes"][0]["nodes"] = [scene.node(children=[1], scale=[0.01] * 3), 2]
+    scene.json["nodes"][0]["translation"] = [100, 0, 0]
+    rig = loaded(tmp_path, scene)
     assert rig.vertices.tolist() == POINTS.tolist()
     np.testing.assert_allclose(rig.joint_transforms, rig.rest_transforms, atol=1e-6)
 
 
-def test_without_inverse_bind_matrices_the_nodes_count(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    del builder.json["skins"][0]["inverseBindMatrices"]
-    rig = load_rig(builder.glb(tmp_path / "rig.glb"))
-    assert torch.equal(rig.joint_transforms, rig.rest_transforms)
-    assert rig.rest_transforms[1, :3, 3].tolist() == [1, 0, 0]
+def test_repeated_names_are_kept_apart(tmp_path, scene):
+    scene.json["nodes"][0]["name"] = "root"
+    scene.json["skins"][0] = {"joints": [1, 0, scene.node(root=True, name="root#1")]}
+    words = r"1 joints have the name of another and are told apart: 'root' \(number 1\) is called \"root#1'\""
+    with pytest.warns(FileWarning, match=words):
+        assert loaded(tmp_path, scene).joint_names == ("root", "root#1'", "root#1")
 
 
-def test_repeated_names_are_told_apart(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    builder.json["nodes"][2]["name"] = "root"
-    builder.json["nodes"].append({"name": "root#1"})
-    builder.json["skins"][0]["joints"].append(3)
-    del builder.json["skins"][0]["inverseBindMatrices"]
-    told = r"1 joints have the name of another and are told apart: 'root' \(number 1\) is called \"root#1'\""
-    with pytest.warns(FileWarning, match=told):
-        rig = load_rig(builder.glb(tmp_path / "rig.glb"))
-    assert rig.joint_names == ("root", "root#1'", "root#1")
-
-
-def change(path: str, value: Any) -> Any:
-    """Return an edit of a document: set the entry at a dotted path."""
-
-    def edit(builder: Builder) -> None:
-        place: Any = builder.json
-        *keys, last = [int(key) if key.isdigit() else key for key in path.split(".")]
-        for key in keys:
-            place = place[key]
-        place[last] = value
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (change("nodes.2.children", [1]), "cyclic at 'root', 'tip'"),
-        (change("nodes.0.children", [2]), "node 'tip' has two parents"),
-        (change("nodes.0.skin", None), "no node carries both"),
-        (change("nodes.1.rotation", [0, 0, 0, 0]), "rotation of node 'root' is a zero quaternion"),
-        (change("nodes.1.translation", [0, 1e999, 0]), "translation of node 'root' is not finite"),
-        (change("nodes.1.matrix", [0] * 16), "not finite or not affine"),
-        (change("nodes.1.scale", [0] * 3), "scales the skin by 0"),
-        (change("nodes.1.scale", [1e200] * 3), r"scales the skin by 1e\+200"),
-        (change("nodes.1.scale", [1e-250] * 3), "scales the skin by 1e-250"),
-        (change("skins.0.joints", []), "1 to 1000 different joints, got 0"),
-        (change("skins.0.joints", [1, 1]), r"different joints, got 2 \(1 different\)"),
-        (lambda b: b.json["meshes"][0]["primitives"][0]["attributes"].pop("JOINTS_0"), "not skinned"),
-        (change("meshes.0.primitives.0.mode", 1), "no triangles"),
-        (change("meshes.0.primitives", []), "no triangles"),
-    ],
-)
-def test_impossible_rigs(tmp_path: Path, edit: Any, message: str) -> None:
-    builder = Builder().skinned()
-    edit(builder)
-    with pytest.raises(ModelError, match=message) as caught:
-        load_rig(builder.glb(tmp_path / "rig.glb"))
-    assert "rig.glb" in str(caught.value)
+IMPOSSIBLE = [
+    ("nodes.0.children", [1], "cyclic at 'tip', 'root'|cyclic at 'root', 'tip'"),
+    ("nodes.2.children", [0], "node 'tip' has two parents"),
+    ("nodes.2.skin", None, "no node carries both"),
+    ("nodes.1.rotation", [0, 0, 0, 0], "rotation of node 'root' is a zero quaternion"),
+    ("nodes.1.translation", [0, 1e999, 0], "translation of node 'root' is not finite"),
+    ("nodes.1.matrix", [0] * 16, "not finite or not affine"),
+    ("nodes.1.scale", [0] * 3, "scales the skin by 0"),
+    ("nodes.1.scale", [1e200] * 3, r"scales the skin by 1e\+200"),
+    ("nodes.1.scale", [1e-250] * 3, "scales the skin by 1e-250"),
+    ("skins.0.joints", [], "1 to 1000 different joints, got 0"),
+    ("skins.0.joints", [1, 1], r"different joints, got 2 \(1 different\)"),
+    ("meshes.0.primitives.0.attributes", {"POSITION": 0}, "not skinned"),
+    ("meshes.0.primitives.0.mode", 1, "no triangles"),
+    ("meshes.0.primitives", [], "no triangles"),
+]
+DAMAGED = [
+    ("accessors.0.count", 5, r"POSITION of primitive 0 of mesh 'body' reaches beyond its buffer"),
+    ("accessors.0.count", 3, "float or normalized weights for each of its 3 vertices"),
+    ("accessors.0.byteOffset", -4, "byteOffset of POSITION"),
+    ("accessors.0.type", "VEC2", "POSITION.*must be VEC3"),
+    ("accessors.0.componentType", 9999, "known component type"),
+    ("meshes.0.primitives.0.attributes.WEIGHTS_0", None, "the accessor of WEIGHTS_0"),
+    ("meshes.0.primitives.0.attributes.WEIGHTS_0", 1, "float or normalized weights"),
+    ("meshes.0.primitives.0.attributes.NORMAL", 4, "must be VEC3"),
+    ("meshes.0.primitives.0.indices", 0, "must be SCALAR"),
+    ("skins.0.joints", [1], "refers to joint 1 of a skin with 1"),
+    ("skins.0.joints", [1, 77], "a joint of skin 0 must be an index below 3"),
+    ("nodes.1.children", [77], "a node of the scene must be an index below 3"),
+    ("nodes.1.translation", [1, 2], "translation of node 'root' must hold 3 numbers"),
+    ("nodes.1.translation", [1, 2, "x"], "not a readable glTF document"),
+    ("nodes.1", None, r"nodes\[1\] must be an object"),
+    ("nodes", 3, "not a readable glTF document"),
+    ("extensionsRequired", ["EXT_meshopt_compression"], "save it again without mesh compression"),
+    ("buffers", [{"byteLength": 10**6}], "buffer 0 should have 1000000 bytes"),
+    ("buffers", [{"byteLength": 4, "uri": "../a.bin"}], "must lie in the file's folder"),
+    ("buffers", [{"byteLength": 4, "uri": "gone.bin"}], r"gone\.bin.*not there"),
+]
 
 
 @pytest.mark.parametrize(
-    ("edit", "message"),
+    ("error", "path", "value", "words"),
+    [*((ModelError, *row) for row in IMPOSSIBLE), *((FormatError, *row) for row in DAMAGED)],
+)
+def test_impossible_rigs_and_damaged_documents(tmp_path, scene, error, path, value, words):
+    scene.change(path, value)
+    with pytest.raises(error, match=rf"(?s)rig\.glb.*({words})"):
+        loaded(tmp_path, scene)
+
+
+@pytest.mark.parametrize(
+    ("error", "changes", "options", "words"),
     [
-        (change("accessors.0.count", 10**12), "12|elements"),
-        (change("accessors.0.count", 5), r"POSITION of primitive 0 of mesh 'body' reaches beyond its buffer"),
-        (change("accessors.0.count", 3), "float or normalized weights for each of its 3 vertices"),
-        (change("accessors.0.byteOffset", -4), "byteOffset of POSITION"),
-        (change("accessors.0.type", "VEC2"), "POSITION.*must be VEC3"),
-        (change("accessors.0.componentType", 9999), "known component type"),
-        (change("accessors.0.bufferView", 99), "must be an index below"),
-        (change("accessors.0.bufferView", None), "has no data"),
-        (change("bufferViews.0.byteOffset", 10**9), "reaches beyond its buffer"),
-        (change("bufferViews.0.buffer", 3), "must be an index below 1"),
-        (change("meshes.0.primitives.0.attributes.WEIGHTS_0", None), "the accessor of WEIGHTS_0"),
-        (change("meshes.0.primitives.0.attributes.WEIGHTS_0", 1), "float or normalized weights"),
-        (change("meshes.0.primitives.0.attributes.NORMAL", 4), "must be VEC3"),
-        (change("meshes.0.primitives.0.indices", 0), "must be SCALAR"),
-        (change("skins.0.joints", [1]), "refers to joint 1 of a skin with 1"),
-        (change("skins.0.joints", [1, 77]), "a joint of skin 0 must be an index below 3"),
-        (change("nodes.1.children", [77]), "a child of node 1"),
-        (change("nodes.1.translation", [1, 2]), "translation of node 'root' must hold 3 numbers"),
-        (change("nodes.1.translation", [1, 2, "x"]), "not a readable glTF document"),
-        (change("nodes.1", None), "nodes must be a list of objects"),
-        (change("nodes", 3), "not a readable glTF document"),
-        (change("extensionsRequired", ["EXT_meshopt_compression"]), "save it again without mesh compression"),
-        (change("buffers", [{"byteLength": 10**6}]), "buffer 0 should have 1000000 bytes"),
-        (change("buffers", [{"byteLength": 4, "uri": "http://example.org/a.bin"}]), "must lie in the file's folder"),
-        (change("buffers", [{"byteLength": 4, "uri": "../a.bin"}]), "must lie in the file's folder"),
-        (change("buffers", [{"byteLength": 4, "uri": "/etc/passwd"}]), "must lie in the file's folder"),
-        (change("buffers", [{"byteLength": 4, "uri": "gone.bin"}]), r"gone\.bin.*not there"),
-        (change("buffers", [{"byteLength": 4, "uri": "data:text/plain,abcd"}]), "must be base64"),
-        (change("buffers", [{"byteLength": 4, "uri": "data:a;base64,%%%"}]), "not valid base64"),
+        (
+            ModelError,
+            {"points": POINTS * np.float32("nan")},
+            {},
+            "POSITION of primitive 0 of mesh 'body' holds non-finite",
+        ),
+        (ModelError, {"WEIGHTS_0": np.zeros((4, 4), "f4")}, {}, "none of 4 vertices has a skin weight"),
+        (ModelError, {"tip": TIP - 2}, {}, "negative skin weights"),
+        (ModelError, {"inverse": INVERSE * np.float32([1, 0])[:, None, None]}, {}, "joint 'tip' is singular"),
+        (FormatError, {"inverse": INVERSE[:1]}, {}, "2 joints but 1 inverse bind"),
+        (FormatError, {"faces": np.array([0, 1, 4])}, {}, "integers from 0 to 3, got 3 from 0 to 4"),
+        (FormatError, {"faces": np.array([0, 1, 2, 3])}, {}, "4 triangle corners, not a multiple of three"),
+        (FormatError, {"NORMAL": POINTS[:2]}, {}, "4 positions but 2 normals"),
+        (FormatError, {}, {"max_points": 3}, "4 vertices with 2 joints; at most 3 vertices"),
+        (FormatError, {}, {"max_bytes": 64}, "the limit is 64"),
     ],
 )
-def test_damaged_documents(tmp_path: Path, edit: Any, message: str) -> None:
-    builder = Builder().skinned()
-    edit(builder)
-    with pytest.raises(FormatError, match=message) as caught:
-        load_rig(builder.glb(tmp_path / "rig.glb"))
-    assert "rig.glb" in str(caught.value)
+def test_numbers_that_are_refused(tmp_path, error, changes, options, words):
+    with pytest.raises(error, match=words):
+        loaded(tmp_path, strip(**changes), limits=FileLimits(**options))
 
 
-def test_numbers_that_are_refused(tmp_path: Path) -> None:
-    def build(points: Any = POINTS, weights: Any = WEIGHTS, inverse: Any = INVERSE_BIND, faces: Any = FACES) -> Path:
-        builder = Builder()
-        builder.primitive(
-            faces, POSITION=builder.add(points), JOINTS_0=builder.add(JOINTS), WEIGHTS_0=builder.add(weights)
-        )
-        builder.json["skins"][0]["inverseBindMatrices"] = builder.matrices(inverse)
-        return builder.glb(tmp_path / "rig.glb")
-
-    with pytest.raises(ModelError, match="POSITION of primitive 0 of mesh 'body' holds non-finite"):
-        load_rig(build(points=POINTS * np.float32("nan")))
-    with pytest.raises(ModelError, match="none of 4 vertices has a skin weight"):
-        load_rig(build(weights=0 * WEIGHTS))
-    with pytest.raises(ModelError, match="negative skin weights"):
-        load_rig(build(weights=-WEIGHTS))
-    with pytest.raises(ModelError, match="joint 'tip' is singular"):
-        load_rig(build(inverse=INVERSE_BIND * np.float32([1, 0])[:, None, None]))
-    with pytest.raises(FormatError, match="2 joints but 1 inverse bind"):
-        load_rig(build(inverse=INVERSE_BIND[:1]))
-    with pytest.raises(FormatError, match="integers from 0 to 3, got 3 from 0 to 4"):
-        load_rig(build(faces=np.array([0, 1, 4], dtype="u1")))
-    with pytest.raises(FormatError, match="4 triangle corners, not a multiple of three"):
-        load_rig(build(faces=np.array([0, 1, 2, 3], dtype="u1")))
-    with pytest.raises(FormatError, match="4 vertices with 2 joints; at most 3 vertices"):
-        load_rig(build(), limits=FileLimits(max_points=3))
-    with pytest.raises(FormatError, match="the limit is 64"):
-        load_rig(build(), limits=FileLimits(max_bytes=64))
+def test_budgets_and_overflow_along_the_hierarchy(tmp_path, scene, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("torchreg.io.gltf_document.FILE_BUDGET", replace(FILE_BUDGET, nodes=2))
+        refused((lambda: loaded(tmp_path, scene), "3 nodes, at most 2"))
+    large = scene.node(scale=[1e200] * 3, children=[1])
+    scene.json["scenes"][0]["nodes"] = [scene.node(scale=[1e200] * 3, children=[large]), 2]
+    refused((lambda: loaded(tmp_path, scene), "rest transform of joint 'root' is not finite"), error=ModelError)
 
 
-def test_overflow_along_the_hierarchy(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    builder.json["nodes"] += [{"scale": [1e200] * 3, "children": [4]}, {"scale": [1e200] * 3, "children": [1]}]
-    with pytest.raises(ModelError, match="rest transform of joint 'root' is not finite"):
-        load_rig(builder.glb(tmp_path / "rig.glb"))
-
-
-def test_uneven_normals_are_refused(tmp_path: Path) -> None:
-    builder = Builder().skinned()
-    builder.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = builder.add(POINTS[:2])
-    with pytest.raises(FormatError, match="4 positions but 2 normals"):
-        load_rig(builder.glb(tmp_path / "rig.glb"))
-
-
-def test_damaged_containers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = Builder().skinned().glb(tmp_path / "whole.glb").read_bytes()
-    path = tmp_path / "rig.glb"
-    cases = {
-        b"glTF": "at least 20 bytes",
-        whole[:200]: "expected glTF 2",
-        whole[:4] + struct.pack("<I", 1) + whole[8:]: "says version 1",
-        whole[:12] + struct.pack("<I", 10**6) + whole[16:]: "chunk at byte 12 reaches beyond",
-        whole[:16] + b"ELSE" + whole[20:]: "must begin with a JSON chunk",
-        whole.replace(b'"asset"', b'"asset ', 1): "not a readable glTF document",
-        b"{}": "no node carries",
-        b"[" * 100_000: "not a readable glTF document",
-        b"\xff\xfe": "not a readable glTF document",
-        b'{"buffers": 3}': "not a readable glTF document|no node",
-    }
-    for content, message in cases.items():
-        path.write_bytes(content)
-        with pytest.raises((FormatError, ModelError), match=message):
-            load_rig(path)
+def test_damaged_containers(tmp_path, scene):
+    whole = scene.content()
     only_json = struct.unpack_from("<I", whole, 12)[0] + 20
-    path.write_bytes(whole[:8] + struct.pack("<I", only_json) + whole[12:only_json])
-    with pytest.raises(FormatError, match="neither an address nor a binary chunk"):
-        load_rig(path)
-    path.write_bytes(whole)
-    monkeypatch.setattr("torchreg.io.gltf_document.FILE_BUDGET", replace(FILE_BUDGET, nodes=2))
-    with pytest.raises(FormatError, match="3 nodes, at most 2"):
-        load_rig(path)
+    for content, words in (
+        (b"glTF", "at least 20 bytes"),
+        (whole[:200], "expected glTF 2"),
+        (whole[:16] + b"ELSE" + whole[20:], "must begin with a JSON chunk"),
+        (whole.replace(b'"asset"', b'"asset ', 1), "not a readable glTF document"),
+        (b"{}", "no node carries"),
+        (b"[" * 100_000, "not a readable glTF document"),
+        (b"\xff\xfe", "not a readable glTF document"),
+        (whole[:8] + struct.pack("<I", only_json) + whole[12:only_json], "neither an address nor a binary chunk"),
+    ):
+        path = put(tmp_path, "rig.glb", content)
+        refused((lambda path=path: load_rig(path), words), error=(FormatError, ModelError))
 
 
-def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place in a JSON document, containers included."""
+def leaves(value, path=()):
+    """Return every place in a JSON document, containers included."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path for path in [path] if path] + [leaf for key, inner in items for leaf in leaves(inner, (*path, key))]
 
@@ -485,20 +305,13 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     st.integers(0, 10**6),
     st.sampled_from([None, True, -1, 0, 1, 7, 2**31, 10**30, 0.5, 1e308, float("nan"), "", "x", [], [0], [None], {}]),
 )
-def test_any_damaged_entry_gives_an_error_or_a_rig(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, value: Any
-) -> None:
-    builder = Builder().skinned()
-    builder.json["buffers"] = [{"byteLength": len(builder.blob)}]
-    places = leaves(builder.json)
-    *keys, last = places[seed % len(places)]
-    place = builder.json
-    for key in keys:
-        place = place[key]
-    place[last] = value
-    path = builder.glb(tmp_path_factory.mktemp("fuzz") / "rig.glb")
+def test_any_damaged_entry_gives_an_error_or_a_rig(tmp_path_factory, seed, value):
+    scene = strip()
+    scene.json["buffers"] = [{"byteLength": len(scene.blob)}]
+    places = leaves(scene.json)
+    scene.change(".".join(map(str, places[seed % len(places)])), value)
     try:
-        rig = load_rig(path)
+        rig = loaded(tmp_path_factory.mktemp("fuzz"), scene)
     except (FormatError, ModelError):
         return
     assert bool(torch.isfinite(rig.vertices).all())
@@ -506,7 +319,7 @@ def test_any_damaged_entry_gives_an_error_or_a_rig(
 
 
 @pytest.mark.skipif(not HAND.is_file(), reason="needs the shared data")
-def test_a_real_hand() -> None:
+def test_a_real_hand():
     flat = load_rig(HAND)
     assert flat.parents == (-1,) * 25
     names = flat.joint_names
@@ -523,3 +336,75 @@ def test_a_real_hand() -> None:
     distal = rig.vertices[rig.weights[:, tip - 1] > 0.5]
     distances = (distal - rig.joint_transforms[tip, :3, 3]).norm(dim=1)
     assert 0.002 < float(distances.min()) < float(distances.max()) < 0.04
+
+
+def test_vertices_without_weight_follow_their_neighbors(tmp_path):
+    scene, weights = Scene(), np.stack([1 - UPPER, UPPER, 0 * UPPER, 0 * UPPER], 1).astype("f4")
+    weights[[5, 33]], weights[6] = 0, np.nan
+    scene.rig([scene.primitive(WEIGHTS_0=weights)])
+    with pytest.warns(FileWarning, match=r"rig\.glb: 3 of 36 vertices have no skin weight and follow the nearest"):
+        rig = loaded(tmp_path, scene)
+    np.testing.assert_allclose(rig.weights[:, 1], UPPER)
+    points = tr.load_points(tmp_path / "rig.glb").points  # as viewers do, after the first joint
+    np.testing.assert_allclose([points.amin(0).numpy(), points.amax(0).numpy()], [[-0.15, 0, -0.15], [0.15, 2, 0.15]])
+
+
+def test_primitives_without_positions_or_skin_are_left_out(tmp_path):
+    scene, empty = Scene(), Scene()
+    whole = scene.primitive()
+    nothing = {"attributes": {}, "indices": whole["indices"]}
+    scene.rig([whole, nothing, scene.plain()])
+    with pytest.warns(FileWarning, match="2 primitives are left out: primitive 1 of mesh 0 has no positions; prim"):
+        rig = loaded(tmp_path, scene)
+    assert (len(rig.vertices), len(rig.faces)) == (36, len(FACES))
+    empty.rig([nothing])
+    words = r"rig\.glb: the skinned mesh has no triangles that a skin moves: primitive 0"
+    refused((lambda: loaded(tmp_path, empty), words), error=ModelError)
+
+
+@pytest.mark.parametrize("matrix", [np.eye(4), np.zeros((4, 4))])
+def test_joints_that_move_nothing_stand_where_their_nodes_do(tmp_path, matrix):
+    scene = Scene()
+    tip = scene.rig()
+    end = scene.node(name="end", translation=[0, 1, 0])
+    scene.json["nodes"][tip]["children"] = [end]
+    scene.skin([1, 0, end], [shift(0, 0, 0), shift(0, -1, 0), matrix])
+    scene.json["skins"].pop(0)
+    with pytest.warns(FileWarning, match="1 joints that move nothing have no bind pose .*: end"):
+        rig = loaded(tmp_path, scene)
+    assert rig.joint_transforms[:, :3, 3].tolist() == [[0, 0, 0], [0, 1, 0], [0, 2, 0]]
+
+
+def test_several_trees_of_joints_hang_on_the_largest(tmp_path):
+    scene = Scene()
+    tip = scene.node(name="tip", translation=[0, 1, 0])
+    lower = scene.node(root=True, name="lower", children=[tip])
+    upper = scene.node(root=True, name="upper", translation=[0, 1, 0])
+    skin = scene.skin([upper, lower, tip], [shift(0, -1, 0), np.eye(4), shift(0, -1, 0)])
+    joints = np.tile(np.array([1, 0, 2, 0], "u1"), (36, 1))
+    scene.node(root=True, mesh=scene.mesh(scene.primitive(JOINTS_0=joints)), skin=skin)
+    with pytest.warns(FileWarning, match=r"a\.glb: the skeleton has 2 roots: 'upper' hang on 'lower'"):
+        shape = tr.ArticulatedShape.from_gltf(scene.save(tmp_path / "a.glb"))
+    assert set(shape.part_names) == {"lower", "upper"}
+    assert [name for name in shape.dof_names if name.startswith("upper")] == ["upper_x", "upper_y", "upper_z"]
+    flat = Scene()
+    skin = flat.skin([flat.node(root=True, name=f"j{k}", translation=[0, 0.5 * k, 0]) for k in range(4)],
+                     [shift(0, -0.5 * k, 0) for k in range(4)])  # fmt: skip
+    flat.node(root=True, mesh=flat.mesh(flat.primitive()), skin=skin)
+    words = r"a\.glb: the skeleton has 4 roots .* name each joint's parent with parents="
+    refused((lambda: tr.ArticulatedShape.from_gltf(flat.save(tmp_path / "a.glb")), words), error=ModelError)
+
+
+def test_one_skin_of_several_is_chosen(tmp_path):
+    scene = Scene()
+    for place in (0, 2):
+        scene.rig(translation=[place, 0, 0], inverse=[shift(-place, 0, 0), shift(-place, -1, 0)])
+    scene.json["skins"][1]["name"] = "right"
+    path = scene.save(tmp_path / "a.glb")
+    with (
+        pytest.warns(FileWarning, match="2 joints have the name of another and are told apart: 'root'"),
+        pytest.warns(FileWarning, match="skins 0 and 1 have skeletons of their own.*skin= reads one of them"),
+    ):
+        assert load_rig(path).parents == (-1, 0, -1, 2)
+    for skin, place in (("right", 2.0), (0, 0.0)):
+        assert tr.ArticulatedShape.from_gltf(path, skin=skin).keypoints(torch.zeros(9))[0, 0] == place

@@ -1,8 +1,7 @@
-"""Robot descriptions: numbers, order, limits, mimic joints, geometry and everything that is refused."""
+"""Robot descriptions: numbers, order, limits, mimic joints, geometry, meshes, and everything that is refused."""
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchreg.errors import FileWarning, FormatError, InputError, ModelError
+import torchreg as tr
+from tests.io.helpers import put, refused
 from torchreg.io.limits import FILE_BUDGET, FileLimits
+from torchreg.io.mesh_files import MeshFiles
 from torchreg.io.urdf import load_urdf
+
+FileWarning, FormatError, ModelError = tr.errors.FileWarning, tr.errors.FormatError, tr.errors.ModelError
+BOX = "<box size='0.1 0.08 0.4'/>"
 
 ARM = """<?xml version="1.0" encoding="utf-8"?>
 <robot name="arm" xmlns:xacro="http://ros.org/wiki/xacro">
@@ -41,55 +45,48 @@ ARM = """<?xml version="1.0" encoding="utf-8"?>
 """
 
 
-def write(folder: Path, text: str, name: str = "robot.urdf") -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
+def robot(*parts, head="<robot name='r'>", end="</robot>"):
+    return "\n".join([head, *parts, end])
 
 
-def robot(*parts: str) -> str:
-    return f"<robot name='r'>{''.join(parts)}</robot>"
-
-
-def joint(name: str, parent: str, child: str, kind: str = "revolute", body: str = "") -> str:
+def joint(name, parent, child, kind="revolute", body=""):
     return f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>{body}</joint>"
 
 
-def links(*names: str) -> str:
+def links(*names):
     return "".join(f"<link name='{name}'/>" for name in names)
 
 
-def with_mesh(filename: str, attributes: str = "", origin: str = "") -> str:
-    shape = f"<geometry><mesh filename='{filename}' {attributes}/></geometry>"
-    return robot(f"<link name='a'><visual>{origin}{shape}</visual></link>")
+def link(name, shape=BOX, tag="visual", origin="<origin xyz='0 0 0.2'/>"):
+    return f"<link name='{name}'><{tag}>{origin}<geometry>{shape}</geometry></{tag}></link>"
 
 
-def test_tree_is_in_order_with_exact_numbers(tmp_path: Path) -> None:
-    record = load_urdf(write(tmp_path, ARM))
+def with_mesh(filename, attributes="", origin=""):
+    return robot(link("a", f"<mesh filename='{filename}' {attributes}/>", origin=origin))
+
+
+def load(folder, text, **options):
+    return load_urdf(put(folder, "robot.urdf", text), **options)
+
+
+def test_tree_is_in_order_with_exact_numbers(tmp_path):
+    record = load(tmp_path, ARM)
     assert record.name == "arm"
     assert record.link_names == ("base", "upper", "lower", "hand")
-    assert [frame.name for frame in record.tree.joints] == ["base", "shoulder", "elbow", "wrist"]
-    assert [frame.parent for frame in record.tree.joints] == [-1, 0, 1, 2]
-    assert [frame.kind for frame in record.tree.joints] == ["fixed", "revolute", "revolute", "prismatic"]
-    shoulder, elbow, wrist = record.tree.joints[1:]
-    assert (shoulder.lower, shoulder.upper) == (-math.inf, math.inf)
-    assert (elbow.lower, elbow.upper, elbow.axis) == (-1, 2, (1, 0, 0))
-    assert (wrist.lower, wrist.upper, wrist.axis) == (-0.1, 0.2, (0, 0, 1))
-    assert shoulder.axis == pytest.approx((0.5**0.5, 0.5**0.5, 0), abs=1e-15)
-    assert shoulder.offset.dtype == torch.float64
-    assert shoulder.offset[:3, 3].tolist() == [0.1, 0.2, 0.3]
-    np.testing.assert_allclose(
-        shoulder.offset[:3, :3], Rotation.from_euler("xyz", [0.4, -0.5, 0.6]).as_matrix(), atol=1e-15
-    )
-
-
-def test_primitives_have_size_and_place(tmp_path: Path) -> None:
-    record = load_urdf(write(tmp_path, ARM))
+    joints = record.tree.joints
+    assert [frame.name for frame in joints] == ["base", "shoulder", "elbow", "wrist"]
+    assert [frame.parent for frame in joints] == [-1, 0, 1, 2]
+    assert [frame.kind for frame in joints] == ["fixed", "revolute", "revolute", "prismatic"]
+    limits = [(frame.lower, frame.upper) for frame in joints[1:]]
+    assert limits == [(-math.inf, math.inf), (-1, 2), (-0.1, 0.2)]
+    assert (joints[2].axis, joints[3].axis) == ((1, 0, 0), (0, 0, 1))
+    assert joints[1].axis == pytest.approx((0.5**0.5, 0.5**0.5, 0), abs=1e-15)
+    assert joints[1].offset[:3, 3].tolist() == [0.1, 0.2, 0.3]
     base, upper, lower, hand = record.link_primitives
     assert base == ()
-    assert (upper[0].kind, upper[0].size) == ("sphere", (0.05,))
-    assert (hand[0].kind, hand[0].size) == ("box", (0.1, 0.2, 0.3))
-    assert (lower[0].kind, lower[0].size) == ("cylinder", (0.02, 0.2))
+    assert [(part[0].kind, part[0].size) for part in (upper, lower, hand)] == [
+        ("sphere", (0.05,)), ("cylinder", (0.02, 0.2)), ("box", (0.1, 0.2, 0.3)),
+    ]  # fmt: skip
     # The cylinder's axis is turned from z to x.
     np.testing.assert_allclose(lower[0].origin @ torch.tensor([0.0, 0, 1, 1]).double(), [1, 0, 0.1, 1], atol=1e-15)
     assert record.link_meshes == (None,) * 4
@@ -97,73 +94,60 @@ def test_primitives_have_size_and_place(tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
-def test_origins_agree_with_scipy(tmp_path_factory: pytest.TempPathFactory, rpy: list[float]) -> None:
-    folder = tmp_path_factory.mktemp("origin")
+def test_origins_agree_with_scipy(tmp_path_factory, rpy):
     body = f"<origin rpy='{' '.join(repr(a) for a in rpy)}'/>"
-    record = load_urdf(write(folder, robot(links("a", "b"), joint("j", "a", "b", "fixed", body))))
+    record = load(tmp_path_factory.mktemp("origin"), robot(links("a", "b"), joint("j", "a", "b", "fixed", body)))
     rotation = record.tree.joints[1].offset[:3, :3]
     np.testing.assert_allclose(rotation, Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-13)
 
 
-def test_deep_chain_and_backward_order(tmp_path: Path) -> None:
+def test_deep_chains_of_links_and_of_mimic_joints_take_time_in_proportion(tmp_path):
     count = 1500
     joints = "".join(joint(f"j{i}", f"l{i}", f"l{i + 1}") for i in reversed(range(count - 1)))
-    record = load_urdf(write(tmp_path, robot(joints, links(*(f"l{i}" for i in reversed(range(count)))))))
+    record = load(tmp_path, robot(joints, links(*(f"l{i}" for i in reversed(range(count))))))
     assert [frame.parent for frame in record.tree.joints] == list(range(-1, count - 1))
+    mimics = [f"<mimic joint='j{k + 1}' multiplier='-1' offset='0.5'/>" for k in range(count - 1)]
+    joints = [joint(f"j{k}", "l0", f"l{k + 1}", body=body) for k, body in enumerate([*mimics, ""])]
+    tree = load(tmp_path, robot(links(*(f"l{k}" for k in range(count + 1))), *joints)).tree
+    by_name, last = {frame.name: frame for frame in tree.joints}, tree.index(f"j{count - 1}")
+    assert by_name["j0"].mimic == (last, -1.0, 0.5)
+    assert by_name["j1"].mimic == (last, 1.0, 0.0)
 
 
-def test_mimic_chains_follow_the_moving_joint(tmp_path: Path) -> None:
+def test_mimic_joints_and_limits_that_are_incomplete(tmp_path):
     text = robot(
-        links("a", "b", "c", "d"),
+        links(*"abcdefg"),
         joint("third", "a", "d", body="<mimic joint='second' multiplier='-2' offset='0.5'/>"),
         joint("second", "a", "c", body="<mimic joint='first' multiplier='3' offset='0.25'/>"),
         joint("first", "a", "b"),
+        joint("effort_only", "a", "e", body="<limit effort='1' velocity='1'/>"),
+        joint("upper_only", "a", "f", body="<limit upper='1'/>"),
+        joint("a", "a", "g"),
     )
-    tree = load_urdf(write(tmp_path, text)).tree
-    first, second, third = (tree.joints[tree.index(name)] for name in ("first", "second", "third"))
-    assert first.mimic is None
-    assert second.mimic == (tree.index("first"), 3, 0.25)
+    record = load(tmp_path, text)
+    tree = record.tree
+    by_name = {frame.name: frame for frame in tree.joints}
+    first = tree.index("first")
     # third = -2 (3 x + 0.25) + 0.5
-    assert third.mimic == (tree.index("first"), -6, 0)
+    assert [by_name[name].mimic for name in ("first", "second", "third")] == [None, (first, 3, 0.25), (first, -6, 0)]
+    limits = [(by_name[name].lower, by_name[name].upper) for name in ("first", "effort_only", "upper_only")]
+    assert limits == [(-math.inf, math.inf)] * 2 + [(0, 1)]
+    assert (tree.joints[0].name, record.link_names[0]) == ("a_root", "a")  # a joint has the root's name
 
 
-def test_limits_that_are_incomplete(tmp_path: Path) -> None:
-    text = robot(
-        links("a", "b", "c", "d"),
-        joint("none", "a", "b"),
-        joint("effort_only", "a", "c", body="<limit effort='1' velocity='1'/>"),
-        joint("upper_only", "a", "d", body="<limit upper='1'/>"),
-    )
-    tree = load_urdf(write(tmp_path, text)).tree
-    assert [(frame.lower, frame.upper) for frame in tree.joints[1:]] == [(-math.inf, math.inf)] * 2 + [(0, 1)]
-
-
-def test_root_named_like_a_joint(tmp_path: Path) -> None:
-    record = load_urdf(write(tmp_path, robot(links("base", "tip"), joint("base", "base", "tip"))))
-    assert [frame.name for frame in record.tree.joints] == ["base_root", "base"]
-    assert record.link_names == ("base", "tip")
-
-
-def test_mesh_is_scaled_then_placed(tmp_path: Path) -> None:
-    box = trimesh.creation.box(extents=(1, 2, 3))
-    box.export(tmp_path / "box.STL")
+def test_meshes_are_scaled_then_placed_and_mirrored_ones_keep_their_outside(tmp_path):
+    for name in ("box.STL", "box.obj"):
+        trimesh.creation.box(extents=(1, 2, 3)).export(tmp_path / name)
     origin = "<origin xyz='1 0 0' rpy='0 0 1.5707963267948966'/>"
-    mesh = load_urdf(write(tmp_path, with_mesh("box.STL", "scale='1 1 0.5'", origin))).link_meshes[0]
-    assert mesh is not None
-    assert mesh.vertices.dtype == torch.float64
-    np.testing.assert_allclose(mesh.bounds(), [[0, -0.5, -0.75], [2, 0.5, 0.75]], atol=1e-7)
-    volume = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy()).volume
-    assert volume == pytest.approx(3, abs=1e-6)
+    (placed,) = load(tmp_path, with_mesh("box.STL", "scale='1 1 0.5'", origin)).link_meshes
+    (mirrored,) = load(tmp_path, with_mesh("box.obj", "scale='1 -1 1'")).link_meshes
+    assert placed.vertices.dtype == torch.float64
+    np.testing.assert_allclose(placed.bounds(), [[0, -0.5, -0.75], [2, 0.5, 0.75]], atol=1e-7)
+    for mesh, volume in ((placed, 3), (mirrored, 6)):
+        assert trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy()).volume == pytest.approx(volume, abs=1e-6)
 
 
-def test_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
-    trimesh.creation.box(extents=(1, 2, 3)).export(tmp_path / "box.obj")
-    mesh = load_urdf(write(tmp_path, with_mesh("box.obj", "scale='1 -1 1'"))).link_meshes[0]
-    assert mesh is not None
-    assert trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy()).volume == pytest.approx(6, abs=1e-6)
-
-
-def test_visuals_are_concatenated_and_collision_stands_in(tmp_path: Path) -> None:
+def test_visuals_are_concatenated_and_collision_stands_in(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.stl")
     shape = "<geometry><mesh filename='box.stl'/></geometry>"
     text = robot(
@@ -172,146 +156,225 @@ def test_visuals_are_concatenated_and_collision_stands_in(tmp_path: Path) -> Non
         f"<link name='b'><visual/><collision>{shape}</collision></link>",
         joint("j", "a", "b"),
     )
-    record = load_urdf(write(tmp_path, text))
+    record = load(tmp_path, text)
     first, second = record.link_meshes
-    assert first is not None
-    assert second is not None
     assert (first.num_faces, second.num_faces) == (24, 12)
     assert float(first.bounds()[1, 0]) == pytest.approx(5.5)
     assert record.link_primitives[0][0].size == (1, 2)
 
 
-@pytest.mark.parametrize("scheme", ["package", "model"])
-def test_packages_are_found(tmp_path: Path, scheme: str) -> None:
-    above = tmp_path / "my_robot"
-    (above / "urdf").mkdir(parents=True)
-    (above / "meshes").mkdir()
-    trimesh.creation.box().export(above / "meshes" / "box.stl")
-    address = f"{scheme}://my_robot/meshes/box.stl"
-    assert load_urdf(write(above / "urdf", with_mesh(address))).link_meshes[0] is not None
-    (tmp_path / "elsewhere").mkdir()
-    outside = write(tmp_path / "elsewhere", with_mesh(address))
-    assert load_urdf(outside, package_dirs=[above]).link_meshes[0] is not None
-    assert load_urdf(outside, package_dirs=[tmp_path]).link_meshes[0] is not None
+def test_colors_of_links_are_those_of_their_first_visual_with_one(tmp_path):
+    def colored(name, *materials):
+        box = "<geometry><box size='1 1 1'/></geometry>"
+        return f"<link name='{name}'>{''.join(f'<visual>{box}{inner}</visual>' for inner in materials)}</link>"
 
-
-def test_missing_mesh_is_named_or_skipped(tmp_path: Path) -> None:
-    path = write(tmp_path, with_mesh("gone.stl"))
-    with pytest.raises(FormatError, match=r"visual of link 'a'.*'gone\.stl' was not found"):
-        load_urdf(path, meshes="require")
-    with pytest.warns(FileWarning, match=r"'gone\.stl' was not found .*package_dirs=; it is left out"):
-        assert load_urdf(path).link_meshes == (None,)
-    assert load_urdf(path, meshes="skip").link_meshes == (None,)
-    with pytest.raises(InputError, match="meshes must be one of warn, require, skip"):
-        load_urdf(path, meshes="maybe")
-    with pytest.raises(FormatError, match="was not found"):
-        load_urdf(write(tmp_path, with_mesh("x" * 5000 + ".stl")), meshes="require")
-
-
-def test_mesh_requests_that_are_refused(tmp_path: Path) -> None:
-    trimesh.creation.box().export(tmp_path / "box.stl")
-    for text, message in (
-        (with_mesh("https://example.org/ball.stl"), "is remote"),
-        (with_mesh(""), "its <mesh> has no filename"),
-        (with_mesh("box.stl", "scale='0 1 1'"), "scale of zero"),
-    ):
-        with pytest.warns(FileWarning, match=message):
-            assert load_urdf(write(tmp_path, text)).link_meshes == (None,)
-    with pytest.raises(FormatError, match="36 vertices"):
-        load_urdf(write(tmp_path, with_mesh("box.stl")), limits=FileLimits(max_points=10))
+    text = robot(
+        "<material name='green'><color rgba='0 1 0 0.5'/></material>",
+        colored("a", "<material name='none'/>", "<material name='green'/>"),
+        colored("b", "<material name='m'><color rgba='1 0 0 1'/></material>"),
+        colored("c", "<material name='x'><color rgba='9 0 0 1'/></material>"),
+        colored("d", "<material><color rgba='red'/></material>"),
+        *(joint(f"j{child}", "a", child, "fixed") for child in "bcd"),
+    )
+    assert load(tmp_path, text).link_colors == ((0, 1, 0), (1, 0, 0), None, None)
 
 
 PAIR = links("a", "b")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (robot(), "1 to 2000 links, got 0"),
-        (robot(*(links(f"l{i}") for i in range(2001))), "1 to 2000 links, got 2001"),
-        (robot(links("a", "a")), "two links are called 'a'"),
-        (robot("<link/>"), "link number 0 has no name"),
-        (robot(links("a", "b", "c"), joint("j", "a", "b"), joint("j", "a", "c")), "two joints are called 'j'"),
-        (robot(links("a", "b")), "disconnected, 2 links have no parent: a, b"),
-        (robot(PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
-        (robot(links("r"), PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
-        (robot(PAIR, joint("j", "a", "a")), "disconnected|cycle"),
-        (
-            robot(PAIR, joint("j", "a", "b"), joint("k", "a", "b")),
-            "'b' has two parents, joints 'j' and 'k': a closed loop is no tree; leave one",
-        ),
-        (robot(PAIR, joint("j", "a", "z")), "joint 'j' has child link 'z'"),
-        (robot(PAIR, "<joint name='j' type='fixed'><child link='b'/></joint>"), "joint 'j' has parent link None"),
-        (robot(PAIR, joint("j", "a", "b", "helical")), "joint 'j' is of type 'helical'; supported: revolute"),
-        (robot(PAIR, joint("j", "a", "b", body="<axis xyz='0 0 0'/>")), "joint 'j' has a zero axis"),
-        (robot(PAIR, joint("j", "a", "b", body="<origin xyz='0 nan 0'/>")), "joint 'j': xyz='0 nan 0'.*not finite"),
-        (robot(PAIR, joint("j", "a", "b", body="<origin rpy='inf 0 0'/>")), "not finite"),
-        (robot(PAIR, joint("j", "a", "b", body="<limit lower='2' upper='1'/>")), "joint 'j' has limits 2.0 to 1.0"),
-        (robot(PAIR, joint("j", "a", "b", body="<mimic joint='z'/>")), "mimics joint 'z', which the file does not"),
-        (robot(PAIR, joint("j", "a", "b", body="<mimic joint='j'/>")), "mimics joint 'j' in a cycle"),
-        (
-            robot(links("a", "b", "c"), joint("f", "a", "b", "fixed"), joint("j", "b", "c", body="<mimic joint='f'/>")),
-            "mimics joint 'f', which is fixed",
-        ),
-    ],
-)
-def test_impossible_robots(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(ModelError, match=message) as caught:
-        load_urdf(write(tmp_path, text))
-    assert "robot.urdf" in str(caught.value)
+def pair(body="", kind="revolute"):
+    return robot(PAIR, joint("j", "a", "b", kind, body))
+
+
+FIXED = joint("f", "a", "b", "fixed") + joint("j", "b", "c", body="<mimic joint='f'/>")
+IMPOSSIBLE = [
+    (robot(), "1 to 2000 links, got 0"),
+    (robot(*(links(f"l{i}") for i in range(2001))), "1 to 2000 links, got 2001"),
+    (robot(links("a", "a")), "two links are called 'a'"),
+    (robot("<link/>"), "link number 0 has no name"),
+    (robot(links("a", "b", "c"), joint("j", "a", "b"), joint("j", "a", "c")), "two joints are called 'j'"),
+    (robot(PAIR), "disconnected, 2 links have no parent: a, b"),
+    (robot(PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
+    (robot(links("r"), PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
+    (robot(PAIR, joint("j", "a", "a")), "disconnected|cycle"),
+    (robot(PAIR, joint("j", "a", "b"), joint("k", "a", "b")),
+     "'b' has two parents, joints 'j' and 'k': a closed loop is no tree; leave one"),
+    (robot(PAIR, joint("j", "a", "z")), "joint 'j' has child link 'z'"),
+    (robot(PAIR, "<joint name='j' type='fixed'><child link='b'/></joint>"), "joint 'j' has parent link None"),
+    (pair(kind="helical"), "joint 'j' is of type 'helical'; supported: revolute"),
+    (pair("<axis xyz='0 0 0'/>"), "joint 'j' has a zero axis"),
+    (pair("<origin xyz='0 nan 0'/>"), "joint 'j': xyz='0 nan 0'.*not finite"),
+    (pair("<origin rpy='inf 0 0'/>"), "not finite"),
+    (pair("<limit lower='2' upper='1'/>"), "joint 'j' has limits 2.0 to 1.0"),
+    (pair("<mimic joint='z'/>"), "mimics joint 'z', which the file does not"),
+    (pair("<mimic joint='j'/>"), "mimics joint 'j' in a cycle"),
+    (robot(links("a", "b", "c"), FIXED), "mimics joint 'f', which is fixed"),
+]  # fmt: skip
+DAMAGED = [
+    ("", "not well-formed XML"),
+    ("<robot>", "not well-formed XML"),
+    ("<sdf/>", "must be <robot>, got <sdf>"),
+    ("<!DOCTYPE robot [<!ENTITY a 'b'>]><robot>&a;</robot>", "document type declaration"),
+    ("<robot>" + "<a>" * 100 + "</a>" * 100 + "</robot>", "more than 64 deep"),
+    ("<robot><xacro:macro/></robot>", "expand them first"),
+    ("<robot xmlns:xacro='http://www.ros.org/wiki/xacro'><xacro:macro name='m'/></robot>", "expand them first"),
+    ("<robot><link name='${prefix}a'/></robot>", "expand them first"),
+    (robot("<xacro:macro name='m'/>"), "holds xacro macros"),
+    (pair("<origin xyz='1 2'/>"), "must hold 3"),
+    (pair("<origin xyz='1 2 x'/>"), "not a list of numbers"),
+    ("<!-- from <xacro:include/> -->\n" + robot(link("base"), end=""), "it ends at line . before an element is closed"),
+    (robot(link("base"), "<link name='b'></joint>"), r"mismatched tag: line 3, column"),
+    ("version https://git-lfs.github.com/spec/v1\nsize 1\n", "is a Git LFS pointer"),
+]
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "not well-formed XML"),
-        ("<robot>", "not well-formed XML"),
-        ("<?xml version='1.0' encoding='klingon'?><robot/>", "not well-formed XML"),
-        ("<sdf/>", "must be <robot>, got <sdf>"),
-        ("<!DOCTYPE robot [<!ENTITY a 'b'>]><robot>&a;</robot>", "document type declaration"),
-        ("<!DOCTYPE robot SYSTEM 'file:///etc/passwd'><robot/>", "document type declaration"),
-        ("<robot>" + "<a>" * 100 + "</a>" * 100 + "</robot>", "more than 64 deep"),
-        ("<robot><xacro:macro/></robot>", "expand them first"),
-        ("<robot xmlns:xacro='http://www.ros.org/wiki/xacro'><xacro:macro name='m'/></robot>", "expand them first"),
-        ("<robot><link name='${prefix}a'/></robot>", "expand them first"),
-        (robot(PAIR, joint("j", "a", "b", body="<origin xyz='1 2'/>")), "must hold 3"),
-        (robot(PAIR, joint("j", "a", "b", body="<origin xyz='1 2 x'/>")), "not a list of numbers"),
-    ],
+    ("error", "text", "words"),
+    [*((ModelError, *row) for row in IMPOSSIBLE), *((FormatError, *row) for row in DAMAGED)],
 )
-def test_damaged_files(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(FormatError, match=message) as caught:
-        load_urdf(write(tmp_path, text))
-    assert "robot.urdf" in str(caught.value)
+def test_impossible_robots_and_damaged_files(tmp_path, error, text, words):
+    with pytest.raises(error, match=rf"(?s)robot\.urdf.*({words})"):
+        load(tmp_path, text)
 
 
-def test_size_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path, ARM)
-    with pytest.raises(FormatError, match="the limit is 100"):
-        load_urdf(path, limits=FileLimits(max_bytes=100))
-    monkeypatch.setattr("torchreg.io.urdf.FILE_BUDGET", replace(FILE_BUDGET, xml_bytes=100))
-    with pytest.raises(FormatError, match="bytes of XML"):
-        load_urdf(path)
-
-
-def test_other_encodings_are_read(tmp_path: Path) -> None:
-    text = "<?xml version='1.0' encoding='utf-16'?>" + robot("<link name='Gelenk-ü'/>")
-    path = tmp_path / "robot.urdf"
-    path.write_bytes(text.encode("utf-16"))
-    assert load_urdf(path).link_names == ("Gelenk-ü",)
-
-
-def test_colors_of_links_are_those_of_their_first_visual_with_one(tmp_path: Path) -> None:
-    def link(name: str, *materials: str) -> str:
-        box = "<geometry><box size='1 1 1'/></geometry>"
-        return f"<link name='{name}'>{''.join(f'<visual>{box}{inner}</visual>' for inner in materials)}</link>"
-
-    red = "<material name='m'><color rgba='1 0 0 1'/></material>"
-    text = robot(
-        "<material name='green'><color rgba='0 1 0 0.5'/></material>",
-        link("a", "<material name='none'/>", "<material name='green'/>"),
-        link("b", red),
-        link("c", "<material name='x'><color rgba='9 0 0 1'/></material>"),
-        link("d", "<material><color rgba='red'/></material>"),
-        *(joint(f"j{child}", "a", child, "fixed") for child in "bcd"),
+def test_size_limits_and_options(tmp_path, monkeypatch):
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    path = put(tmp_path, "m.urdf", with_mesh("box.stl"))
+    refused(
+        (lambda: load(tmp_path, ARM, limits=FileLimits(max_bytes=100)), "the limit is 100"),
+        (lambda: load_urdf(path, limits=FileLimits(max_points=10)), "36 vertices"),
     )
-    assert load_urdf(write(tmp_path, text)).link_colors == ((0, 1, 0), (1, 0, 0), None, None)
+    refused((lambda: load_urdf(path, meshes="maybe"), "meshes must be one of warn, require, skip"), error=ValueError)
+    monkeypatch.setattr("torchreg.io.urdf.FILE_BUDGET", replace(FILE_BUDGET, xml_bytes=100))
+    refused((lambda: load(tmp_path, ARM), "bytes of XML"))
+
+
+def test_missing_meshes_are_named_or_skipped(tmp_path):
+    path = put(tmp_path, "m.urdf", with_mesh("gone.stl"))
+    refused((lambda: load_urdf(path, meshes="require"), r"visual of link 'a'.*'gone\.stl' was not found"))
+    with pytest.warns(FileWarning, match=r"'gone\.stl' was not found .*package_dirs=; it is left out"):
+        assert load_urdf(path).link_meshes == (None,)
+    assert load_urdf(path, meshes="skip").link_meshes == (None,)
+    # Other geometry stands in for it.
+    visual = "<visual><geometry><mesh filename='gone.stl'/></geometry></visual>"
+    text = robot(f"<link name='base'>{visual}<collision><geometry>{BOX}</geometry></collision></link>")
+    with pytest.warns(FileWarning, match=r"robot\.urdf: visual of link 'base': mesh file 'gone\.stl' was not found"):
+        assert [solid.kind for solid in load(tmp_path, text).link_primitives[0]] == ["box"]
+    put(tmp_path, "gone.stl", "version https://git-lfs.github.com/spec/v1\nsize 1\n")
+    with pytest.warns(FileWarning, match=r"gone\.stl is a Git LFS pointer.*it is left out"):
+        assert [solid.kind for solid in load(tmp_path, text).link_primitives[0]] == ["box"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (with_mesh("https://example.org/ball.stl"), "is remote"),
+        (with_mesh(""), "its <mesh> has no filename"),
+        (with_mesh("box.stl", "scale='0 1 1'"), "scale of zero"),
+    ],
+)
+def test_meshes_that_cannot_be_are_left_out(tmp_path, text, words):
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    with pytest.warns(FileWarning, match=words):
+        assert load(tmp_path, text).link_meshes == (None,)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A robot's folder, in which box.stl is 1 m, and other/box.stl 2 m wide."""
+    (tmp_path / "robot" / "other").mkdir(parents=True)
+    for name, size in (("box.stl", 1), ("other/box.stl", 2)):
+        trimesh.creation.box(extents=(size, 1, 1)).export(tmp_path / "robot" / name)
+    return tmp_path / "robot"
+
+
+def mesh(folder, name, package_dirs=(), require=True, limits=None):
+    found = MeshFiles(folder / "robot.urdf", list(package_dirs), require, limits or FileLimits())
+    return found.read(name, "a")
+
+
+def width(mesh):
+    return float(mesh.bounds()[1, 0] - mesh.bounds()[0, 0])
+
+
+def test_names_of_meshes_are_places_addresses_or_packages(folder, tmp_path):
+    for name, size in (
+        ("box.stl", 1), ("other/box.stl", 2), ("../robot/box.stl", 1), (f"file://{folder}/other/box.stl", 2),
+        (f"file://{folder}/%62ox.stl", 1), ("package://robot/box.stl", 1), ("model://robot/other/box.stl", 2),
+    ):  # fmt: skip
+        assert width(mesh(folder, name)) == size, name
+    away, mine, name = tmp_path / "elsewhere", tmp_path / "mine" / "robot", "package://other/box.stl"
+    away.mkdir()
+    mine.mkdir(parents=True)
+    for place in (folder, folder / "other"):
+        assert width(mesh(away, name, [place])) == 2
+    trimesh.creation.box(extents=(3, 1, 1)).export(mine / "box.stl")
+    assert width(mesh(folder, "package://robot/box.stl", [mine])) == 3  # given folders come first
+    refused(
+        (lambda: mesh(away, name), r"a: mesh file 'package://other/box\.stl' was not found \(looked at "),
+        (lambda: mesh(folder, "https://example.org/ball.stl"), "is remote; save it beside the URDF"),
+        (lambda: mesh(folder, "box.stl", limits=FileLimits(max_bytes=100)), "the limit is 100"),
+    )
+    for gone in ("gone.stl", "x" * 5000 + ".stl"):
+        refused((lambda gone=gone: mesh(folder, gone), "was not found"))
+        assert mesh(folder, gone, require=False) is None
+
+
+def test_files_are_read_once_and_scenes_are_put_together(folder):
+    found = MeshFiles(folder / "robot.urdf", [], True, FileLimits())
+    first = found.read("box.stl", "a")
+    put(folder, "box.stl", b"damaged since")
+    assert found.read("box.stl", "b") is first
+    assert first.vertices.dtype == torch.float64
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([3, 0, 0]))
+    scene.add_geometry(trimesh.creation.box())
+    scene.export(folder / "two.glb")
+    two = mesh(folder, "two.glb")
+    assert two.num_faces == 24
+    np.testing.assert_allclose(two.bounds()[:, 0], [-0.5, 3.5], atol=1e-6)
+
+
+def test_collada_needs_its_extra(folder, monkeypatch):
+    put(folder, "box.dae", b"<COLLADA/>")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    words = r"a: .*torchreg-articulated\[urdf\]"
+    refused((lambda: mesh(folder, "box.dae"), words), error=tr.errors.MissingExtraError)
+    assert mesh(folder, "box.dae", require=False) is None
+
+
+def test_collada_comes_in_metres_and_without_its_looks(folder):
+    pytest.importorskip("collada")
+    content = trimesh.exchange.dae.export_collada(trimesh.creation.box())
+    broken = content.replace(b"<library_effects>", b"<library_effects><effect id='x'><profile_COMMON/></effect>", 1)
+    for text, size in (
+        (content, 1),
+        (content.replace(b"<up_axis>", b'<unit name="cm" meter="0.01"/><up_axis>', 1), 0.01),
+        (b"\n" + broken.replace(b"#", b"#no", 1), 1),
+    ):
+        put(folder, "box.dae", text)
+        assert width(mesh(folder, "box.dae")) == pytest.approx(size)
+    doctype = put(folder, "type.dae", b'<!DOCTYPE a [<!ENTITY b "c">]>' + content)
+    bad = put(folder, "bad.dae", b"not xml")
+    refused(
+        (lambda: mesh(folder, doctype.name), r"type\.dae: .*document type"),
+        (lambda: mesh(folder, bad.name), r"bad\.dae: not a readable dae mesh"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("bad.stl", b"solid nothing", r"bad\.stl"),
+        ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: "),
+        ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: "),
+        ("empty.obj", b"v 0 0 0\n", r"empty\.obj"),
+        ("bad.glb", b"glTF", r"bad\.glb: "),
+        ("mesh.fbx", b"x", r"meshes of kind '\.fbx' are not read"),
+    ],
+)
+@pytest.mark.parametrize("require", [True, False])
+def test_damaged_meshes_are_refused_though_missing_ones_may_be_left_out(folder, name, content, words, require):
+    put(folder, name, content)
+    with pytest.raises(FormatError, match=words):
+        mesh(folder, name, require=require)

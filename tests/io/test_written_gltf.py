@@ -3,9 +3,7 @@
 import json
 import os
 import shutil
-import struct
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pygltflib
@@ -15,20 +13,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+import torchreg as tr
+from tests.io.helpers import KINDS, TYPES, refused
+from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.upright import to_y_up
 from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.io.gltf_write import save_animated_parts, save_animated_skin
-from torchreg.io.points import load_points
 
-DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+InputError = tr.errors.InputError
 PARENTS = [2, -1, 1, 1]
 NAMES = ["tip", "root", "middle", "other"]
 
 
-def random_rigid(rng: np.random.Generator, *batch: int) -> np.ndarray:
+def random_rigid(rng, *batch):
     matrices = np.tile(np.eye(4), (*batch, 1, 1))
     count = int(np.prod(batch))
     matrices[..., :3, :3] = Rotation.random(count, random_state=rng).as_matrix().reshape(*batch, 3, 3)
@@ -36,7 +33,7 @@ def random_rigid(rng: np.random.Generator, *batch: int) -> np.ndarray:
     return matrices
 
 
-def scene(seed: int = 0, joints: int = 4, frames: int = 6, spread: int = 4) -> dict:
+def scene(seed=0, joints=4, frames=6, spread=4):
     """Arguments of save_animated_skin, as arrays; every vertex follows ``spread`` joints."""
     rng = np.random.default_rng(seed)
     vertices = rng.normal(size=(30, 3))
@@ -55,13 +52,13 @@ def scene(seed: int = 0, joints: int = 4, frames: int = 6, spread: int = 4) -> d
     }
 
 
-def save(path: Path, arguments: dict) -> Path:
+def save(path, arguments):
     return save_animated_skin(
         path, **{k: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
     )
 
 
-def blend(arguments: dict, frame: int) -> np.ndarray:
+def blend(arguments, frame):
     """Linear blend skinning from its definition, one vertex and joint at a time."""
     posed = np.zeros((len(arguments["vertices"]), 3))
     for j in range(arguments["weights"].shape[1]):
@@ -71,46 +68,52 @@ def blend(arguments: dict, frame: int) -> np.ndarray:
 
 
 class Player:
-    """A minimal viewer: reads a file with pygltflib and evaluates nodes, animation and skin."""
+    """A minimal viewer: reads a file with pygltflib and evaluates nodes, animation, skin and morph targets."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.gltf = pygltflib.GLTF2().load(str(path))
         self.blob = self.gltf.binary_blob()
 
-    def accessor(self, index: int) -> np.ndarray:
+    def accessor(self, index):
         accessor = self.gltf.accessors[index]
         view = self.gltf.bufferViews[accessor.bufferView]
-        dtype, width = DTYPES[accessor.componentType], WIDTHS[accessor.type]
-        return np.frombuffer(self.blob, dtype, accessor.count * width, view.byteOffset).reshape(-1, width)
+        assert not view.byteStride
+        dtype = next(kind for kind, code in KINDS.items() if code == accessor.componentType)
+        width = next(width for width, name in TYPES.items() if name == accessor.type)
+        start = view.byteOffset + (accessor.byteOffset or 0)
+        return np.frombuffer(self.blob, f"<{dtype}", accessor.count * width, start).reshape(-1, width)
 
-    def world(self, time: float | None) -> list[np.ndarray]:
-        """Node transforms at a time, or of the file's rest pose."""
-        tracks: dict[tuple[int, str], tuple[np.ndarray, np.ndarray]] = {}
-        for channel in self.gltf.animations[0].channels:
-            sampler = self.gltf.animations[0].samplers[channel.sampler]
-            tracks[channel.target.node, channel.target.path] = (
+    def tracks(self):
+        """Return times and values by node and path."""
+        clip = self.gltf.animations[0]
+        return {
+            (channel.target.node, channel.target.path): (
                 self.accessor(sampler.input)[:, 0],
                 self.accessor(sampler.output),
             )
+            for channel, sampler in ((channel, clip.samplers[channel.sampler]) for channel in clip.channels)
+        }
+
+    def world(self, time):
+        """Return node transforms at a time, or of the file's rest pose."""
+        tracks = self.tracks() if time is not None else {}
         local = []
         for index, node in enumerate(self.gltf.nodes):
-            translation = np.array(node.translation or [0, 0, 0])
-            rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1])
-            if time is not None and (index, "translation") in tracks:
-                times, values = tracks[index, "translation"]
-                translation = np.array([np.interp(time, times, values[:, c]) for c in range(3)])
-                times, values = tracks[index, "rotation"]
-                rotation = (
-                    Slerp(times, Rotation.from_quat(values))(np.clip(time, times[0], times[-1]))
-                    if len(times) > 1
-                    else Rotation.from_quat(values[0])
-                )
             matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = rotation.as_matrix(), translation
+            matrix[:3, 3] = node.translation or [0, 0, 0]
+            rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1])
+            if (index, "translation") in tracks:
+                times, values = tracks[index, "translation"]
+                matrix[:3, 3] = [np.interp(time, times, values[:, c]) for c in range(3)]
+            if (index, "rotation") in tracks:
+                times, values = tracks[index, "rotation"]
+                turns = Rotation.from_quat(values)
+                rotation = Slerp(times, turns)(np.clip(time, times[0], times[-1])) if len(times) > 1 else turns[0]
+            matrix[:3, :3] = rotation.as_matrix()
             local.append(matrix)
-        world: list[np.ndarray] = [np.eye(4)] * len(local)
+        world = [np.eye(4)] * len(local)
 
-        def visit(index: int, above: np.ndarray) -> None:
+        def visit(index, above):
             world[index] = above @ local[index]
             for child in self.gltf.nodes[index].children:
                 visit(child, world[index])
@@ -119,12 +122,14 @@ class Player:
             visit(root, np.eye(4))
         return world
 
-    def skinned(self, time: float | None) -> np.ndarray:
-        attributes = self.gltf.meshes[0].primitives[0].attributes
-        skin = self.gltf.skins[0]
-        inverse = self.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(float)
+    def joints(self, time=None):
         world = self.world(time)
-        matrices = np.stack([world[node] @ inverse[j] for j, node in enumerate(skin.joints)])
+        return np.stack([world[node] for node in self.gltf.skins[0].joints])
+
+    def skinned(self, time):
+        attributes = self.gltf.meshes[0].primitives[0].attributes
+        inverse = self.accessor(self.gltf.skins[0].inverseBindMatrices)
+        matrices = self.joints(time) @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1).astype(float)
         points = np.c_[self.accessor(attributes.POSITION), np.ones(self.gltf.accessors[attributes.POSITION].count)]
         posed = np.zeros((len(points), 4))
         for number in range(2):
@@ -134,9 +139,20 @@ class Player:
                 posed += np.einsum("vk,vkab,vb->va", weights, matrices[joints], points)
         return posed[:, :3]
 
+    def morphed(self, time):
+        primitive, ((times, shares),) = self.gltf.meshes[0].primitives[0], self.tracks().values()
+        weights = [np.interp(time, times, row) for row in shares.reshape(len(times), -1).T]
+        return {
+            name: self.accessor(getattr(primitive.attributes, name))
+            + sum(
+                weight * self.accessor(target[name]) for weight, target in zip(weights, primitive.targets, strict=True)
+            )
+            for name in ("POSITION", "NORMAL")
+        }
+
 
 @pytest.mark.parametrize(("joints", "spread"), [(1, 1), (4, 4), (9, 4), (9, 7), (300, 8)])
-def test_file_plays_like_blend_skinning(tmp_path: Path, joints: int, spread: int) -> None:
+def test_file_plays_like_blend_skinning(tmp_path, joints, spread):
     arguments = scene(joints, joints, spread=spread)
     if joints == 300:  # a long chain of meter-long steps would lose digits to float32
         arguments["rest_transforms"][:, :3, 3] *= 0.01
@@ -148,7 +164,7 @@ def test_file_plays_like_blend_skinning(tmp_path: Path, joints: int, spread: int
         np.testing.assert_allclose(player.skinned(float(np.float32(time))), blend(arguments, frame), atol=1e-5)
 
 
-def test_nodes_follow_the_given_hierarchy(tmp_path: Path) -> None:
+def test_nodes_follow_the_given_hierarchy(tmp_path):
     arguments = scene()
     player = Player(save(tmp_path / "a.glb", arguments))
     gltf = player.gltf
@@ -156,12 +172,11 @@ def test_nodes_follow_the_given_hierarchy(tmp_path: Path) -> None:
     for index, parent in enumerate(PARENTS):
         above = [n.name for n in gltf.nodes if gltf.skins[0].joints[index] in n.children]
         assert above == [NAMES[parent] if parent >= 0 else "armature"]
-    world = player.world(float(np.float32(arguments["times"][3])))
-    for index, node in enumerate(gltf.skins[0].joints):
-        np.testing.assert_allclose(world[node], arguments["joint_transforms"][3, index], atol=2e-6)
+    joints = player.joints(float(np.float32(arguments["times"][3])))
+    np.testing.assert_allclose(joints, arguments["joint_transforms"][3], atol=2e-6)
 
 
-def test_quaternions_take_the_short_way_through_full_turns(tmp_path: Path) -> None:
+def test_quaternions_take_the_short_way_through_full_turns(tmp_path):
     arguments = scene(joints=1, frames=80, spread=1)
     angles = np.linspace(0, 6 * np.pi, 80)
     arguments["joint_transforms"][:, 0, :3, :3] = Rotation.from_rotvec(np.outer(angles, [0.6, 0, 0.8])).as_matrix()
@@ -173,7 +188,7 @@ def test_quaternions_take_the_short_way_through_full_turns(tmp_path: Path) -> No
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
-def test_node_rotations_agree_with_scipy(tmp_path_factory: pytest.TempPathFactory, vector: list[float]) -> None:
+def test_node_rotations_agree_with_scipy(tmp_path_factory, vector):
     transform = np.eye(4)[None, None]
     transform = np.tile(transform, (1, 1, 1, 1))
     transform[0, 0, :3, :3] = Rotation.from_rotvec(vector).as_matrix()
@@ -183,7 +198,7 @@ def test_node_rotations_agree_with_scipy(tmp_path_factory: pytest.TempPathFactor
     assert (stored.inv() * Rotation.from_rotvec(vector)).magnitude() < 1e-6
 
 
-def test_accessors_are_aligned_and_bounded(tmp_path: Path) -> None:
+def test_accessors_are_aligned_and_bounded(tmp_path):
     arguments = scene(joints=9, spread=6)
     arguments |= {"normals": np.r_[np.zeros((1, 3)), np.ones((29, 3))], "colors": np.full((30, 3), 0.25)}
     player = Player(save(tmp_path / "a.glb", arguments))
@@ -206,7 +221,7 @@ def test_accessors_are_aligned_and_bounded(tmp_path: Path) -> None:
     np.testing.assert_allclose(player.accessor(attributes.COLOR_0), np.tile([0.25, 0.25, 0.25, 1], (30, 1)))
 
 
-def test_small_fifth_weights_are_dropped(tmp_path: Path) -> None:
+def test_small_fifth_weights_are_dropped(tmp_path):
     arguments = scene(joints=9, spread=4)
     arguments["weights"] = arguments["weights"] + 5e-5
     player = Player(save(tmp_path / "a.glb", arguments))
@@ -215,7 +230,7 @@ def test_small_fifth_weights_are_dropped(tmp_path: Path) -> None:
     np.testing.assert_allclose(player.accessor(attributes.WEIGHTS_0).sum(1), 1, atol=2e-7)
 
 
-def test_large_indices_get_four_bytes(tmp_path: Path) -> None:
+def test_large_indices_get_four_bytes(tmp_path):
     arguments = scene(joints=1, frames=1, spread=1)
     count = 65536
     arguments |= {"vertices": np.zeros((count, 3)), "weights": np.ones((count, 1)), "faces": np.array([[0, 1, 65535]])}
@@ -223,7 +238,7 @@ def test_large_indices_get_four_bytes(tmp_path: Path) -> None:
     assert player.accessor(player.gltf.meshes[0].primitives[0].indices)[:, 0].tolist() == [0, 1, 65535]
 
 
-def test_parts_move_as_nodes(tmp_path: Path) -> None:
+def test_parts_move_as_nodes(tmp_path):
     rng = np.random.default_rng(3)
     transforms = random_rigid(rng, 5, 3)
     meshes = [unit_sphere(1), None, unit_sphere(0, dtype=torch.float64)]
@@ -237,14 +252,14 @@ def test_parts_move_as_nodes(tmp_path: Path) -> None:
     for frame in range(5):
         np.testing.assert_allclose(np.stack(player.world(frame * 0.5)), transforms[frame], atol=1e-6)
     points = player.accessor(player.gltf.meshes[1].primitives[0].attributes.POSITION)
-    np.testing.assert_allclose(points, meshes[2].vertices, atol=1e-7)  # type: ignore[union-attr]
+    np.testing.assert_allclose(points, meshes[2].vertices, atol=1e-7)
     factor = player.gltf.materials[1].pbrMetallicRoughness.baseColorFactor
     assert factor == [0, 0, 1, 1]
     unnamed = save_animated_parts(tmp_path / "q.glb", meshes, torch.from_numpy(transforms), times)
     assert [node.name for node in Player(unnamed).gltf.nodes] == ["part_0", "part_1", "part_2"]
 
 
-def test_parts_move_with_their_parents(tmp_path: Path) -> None:
+def test_parts_move_with_their_parents(tmp_path):
     rng = np.random.default_rng(4)
     transforms = random_rigid(rng, 3, 3)
     ball = unit_sphere(1)
@@ -259,24 +274,6 @@ def test_parts_move_with_their_parents(tmp_path: Path) -> None:
     attributes = [mesh.primitives[0].attributes for mesh in player.gltf.meshes]
     np.testing.assert_allclose(player.accessor(attributes[0].NORMAL), ball.vertices, atol=1e-6)
     assert attributes[1].NORMAL is None
-
-
-def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "a.glb"
-    target.write_bytes(b"before")
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        save(target, scene())
-    monkeypatch.undo()
-    assert target.read_bytes() == b"before"
-    assert os.listdir(tmp_path) == ["a.glb"]
-    save(target, scene())
-    length = struct.unpack("<I", target.read_bytes()[8:12])[0]
-    assert length == target.stat().st_size
 
 
 NONRIGID = np.tile(np.diag([1.0, 1.0, 1.1, 1.0]), (4, 1, 1))
@@ -309,24 +306,29 @@ MIRROR = np.tile(np.diag([1.0, 1.0, -1.0, 1.0]), (4, 1, 1))
         ({"normals": np.zeros((29, 3))}, r"normals must have shape \(30, 3\)"),
     ],
 )
-def test_bad_arguments_are_named(tmp_path: Path, change: dict, message: str) -> None:
+def test_bad_arguments_are_named(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         save(tmp_path / "a.glb", scene() | change)
     assert not list(tmp_path.iterdir())
 
 
-def test_bad_paths_types_and_parts(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"must end in \.glb"):
-        save(tmp_path / "a.gltf", scene())
-    with pytest.raises(InputError, match="existing folder"):
-        save(tmp_path / "no" / "a.glb", scene())
-    with pytest.raises(InputTypeError, match="faces must hold integers"):
-        save(tmp_path / "a.glb", scene() | {"faces": np.zeros((1, 3))})
-    with pytest.raises(InputError, match=r"one mesh per part name \(2\), got 1"):
-        save_animated_parts(tmp_path / "a.glb", [None], torch.eye(4).expand(1, 2, 4, 4), torch.zeros(1), ["a", "b"])
-    empty = TriangleMesh(torch.zeros(3, 3), torch.zeros(0, 3, dtype=torch.int64))
-    with pytest.raises(InputError, match=r"part_meshes\[0\]\.faces"):
-        save_animated_parts(tmp_path / "a.glb", [empty], torch.eye(4).expand(1, 1, 4, 4), torch.zeros(1))
+def test_bad_paths_types_and_parts(tmp_path):
+    def parts(mesh, *names):
+        count = max(len(names), 1)
+        return save_animated_parts(
+            tmp_path / "a.glb", [mesh], torch.eye(4).expand(1, count, 4, 4), torch.zeros(1), names or None
+        )
+
+    empty = tr.TriangleMesh(torch.zeros(3, 3), torch.zeros(0, 3, dtype=torch.int64))
+    refused(
+        (lambda: save(tmp_path / "a.gltf", scene()), r"must end in \.glb"),
+        (lambda: save(tmp_path / "no" / "a.glb", scene()), "existing folder"),
+        (lambda: parts(None, "a", "b"), r"one mesh per part name \(2\), got 1"),
+        (lambda: parts(empty), r"part_meshes\[0\]\.faces"),
+        error=InputError,
+    )
+    floats = scene() | {"faces": np.zeros((1, 3))}
+    refused((lambda: save(tmp_path / "a.glb", floats), "faces must hold integers"), error=tr.errors.InputTypeError)
 
 
 VALIDATOR = os.environ.get("GLTF_VALIDATOR", "")
@@ -336,7 +338,7 @@ VALIDATOR = os.environ.get("GLTF_VALIDATOR", "")
     not (VALIDATOR and shutil.which("node")),
     reason="set GLTF_VALIDATOR to the folder of the npm package gltf-validator",
 )
-def test_khronos_validator_finds_no_errors(tmp_path: Path) -> None:
+def test_khronos_validator_finds_no_errors(tmp_path):
     arguments = scene(joints=9, spread=6) | {"normals": np.ones((30, 3)), "colors": np.full((30, 4), 0.5)}
     files = [save(tmp_path / "a.glb", arguments), save(tmp_path / "b.glb", scene(spread=2))]
     part = torch.eye(4).expand(2, 1, 4, 4)
@@ -358,20 +360,19 @@ def test_khronos_validator_finds_no_errors(tmp_path: Path) -> None:
         assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
 
-def test_four_weights_are_enough_where_they_are_asked_for(tmp_path: Path) -> None:
+def test_four_weights_are_enough_where_they_are_asked_for(tmp_path):
     arguments = scene(joints=9, spread=6)
     player = Player(save(tmp_path / "a.glb", arguments | {"most_weights": 4}))
     assert not hasattr(player.gltf.meshes[0].primitives[0].attributes, "JOINTS_1")
     kept = np.where(arguments["weights"] >= np.sort(arguments["weights"], axis=1)[:, -4:-3], arguments["weights"], 0)
     expected = blend(arguments | {"weights": kept / kept.sum(1, keepdims=True)}, 2)
     np.testing.assert_allclose(player.skinned(arguments["times"][2]), expected, atol=1e-5)
-    with pytest.raises(InputError, match="most_weights must be 4, 8 or None, got 5"):
-        save(tmp_path / "b.glb", arguments | {"most_weights": 5})
+    odd = arguments | {"most_weights": 5}
+    refused((lambda: save(tmp_path / "b.glb", odd), "most_weights must be 4, 8 or None, got 5"), error=InputError)
 
 
 BALL = unit_sphere(1)
 TIMES = torch.tensor([0.0, 0.5, 2.0])
-COMPONENTS = {5123: np.uint16, 5126: np.float32}
 
 
 @pytest.fixture
@@ -380,41 +381,18 @@ def frames():
     return BALL.vertices + noise
 
 
-def play(path, time):
-    """Evaluate a file at a time as the specification says."""
-    gltf = pygltflib.GLTF2().load(str(path))
-    blob = gltf.binary_blob()
-
-    def read(index):
-        accessor = gltf.accessors[index]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type]
-        start = gltf.bufferViews[accessor.bufferView].byteOffset
-        return np.frombuffer(blob, COMPONENTS[accessor.componentType], accessor.count * width, start).reshape(-1, width)
-
-    primitive = gltf.meshes[0].primitives[0]
-    (sampler,) = gltf.animations[0].samplers
-    keys = read(sampler.input)[:, 0]
-    shares = read(sampler.output).reshape(len(keys), -1)
-    weights = [np.interp(time, keys, row) for row in shares.T]
-    return {
-        name: read(getattr(primitive.attributes, name))
-        + sum(weight * read(target[name]) for weight, target in zip(weights, primitive.targets, strict=True))
-        for name in ("POSITION", "NORMAL")
-    }
-
-
 def test_frames_are_met_and_lines_lead_between_them(frames, tmp_path):
-    path = save_vertex_animation(tmp_path / "a.glb", frames, BALL.faces, TIMES)
+    player = Player(save_vertex_animation(tmp_path / "a.glb", frames, BALL.faces, TIMES))
     for time, frame in zip(TIMES, frames, strict=True):
-        found = play(path, float(time))
+        found = player.morphed(float(time))
         np.testing.assert_allclose(found["POSITION"], frame, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(found["NORMAL"], axis=-1), 1, atol=1e-5)
-    np.testing.assert_allclose(play(path, 1.25)["POSITION"], (frames[1] + frames[2]) / 2, atol=1e-6)
+    np.testing.assert_allclose(player.morphed(1.25)["POSITION"], (frames[1] + frames[2]) / 2, atol=1e-6)
 
 
 def test_colors_and_the_first_frame_are_read_back(frames, tmp_path):
     colors = torch.rand(len(BALL.vertices), 3, generator=torch.Generator().manual_seed(1))
-    cloud = load_points(save_vertex_animation(tmp_path / "a.glb", frames, BALL.faces, TIMES, colors))
+    cloud = tr.load_points(save_vertex_animation(tmp_path / "a.glb", frames, BALL.faces, TIMES, colors))
     np.testing.assert_allclose(cloud.points, frames[0], atol=1e-6)
     np.testing.assert_allclose(cloud.colors, colors, atol=1e-6)
 
@@ -445,7 +423,7 @@ def test_what_is_upright_becomes_gltfs_y(tmp_path, up):
         tmp_path / "a.glb", points, torch.tensor([[0, 1, 2]]), torch.ones(3, 1), ["root"], [-1], frames[0], frames,
         torch.zeros(1), up=up,
     )  # fmt: skip
-    read = load_points(tmp_path / "a.glb").points
+    read = tr.load_points(tmp_path / "a.glb").points
     turn = to_y_up(up)
     assert torch.allclose(turn[:3, :3] @ torch.tensor(up).double(), torch.tensor([0.0, 1.0, 0.0]).double())
     assert float(torch.linalg.det(turn[:3, :3])) == 1.0
