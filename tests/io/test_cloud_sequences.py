@@ -1,6 +1,6 @@
-import io
+"""Sequences of clouds: folders, lists and archives, their order, and what is refused."""
+
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +8,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.errors import FormatError, InputError, InputTypeError
-from torchreg.io.frames import Frames, load_frames, save_frames
+import torchreg as tr
+from tests.io.helpers import put, refused
+from tests.io.test_array_files import header
+from torchreg.io.frames import save_frames
+from torchreg.io.images import list_frames, list_pictures
 from torchreg.io.limits import FileLimits
-from torchreg.io.natural_order import natural_key
-from torchreg.io.points import load_mesh, load_points, save_points
+from torchreg.io.natural_order import natural_sorted
+from torchreg.io.points import save_points
+
+FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
 
 
 def clouds(*counts, dtype=torch.float32, seed=0):
@@ -25,59 +30,59 @@ def same(frames, expected):
     return all(torch.equal(a, b) for a, b in zip(frames, expected, strict=True))
 
 
+def archived(folder, **arrays):
+    np.savez(folder / "s.npz", **arrays)
+    return folder / "s.npz"
+
+
 def test_folder_round_trip(tmp_path):
     made = clouds(5, 3, 4)
     files = save_frames(tmp_path / "frames", made)
     assert [file.name for file in files] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
-    frames = load_frames(tmp_path / "frames")
+    frames = tr.load_frames(tmp_path / "frames")
     assert same(frames, made)
     assert frames.names == tuple(map(str, files))
     assert same(frames[1:], made[1:])
-    assert isinstance(frames[1:], Frames)
+    assert type(frames[1:]) is type(frames)
     assert frames[1:].names == frames.names[1:]
     assert torch.equal(frames[-1], made[-1])
-    assert same(load_frames(str(tmp_path / "frames")), made)
-    with pytest.raises(IndexError):
-        frames[3]
+    assert same(tr.load_frames(str(tmp_path / "frames")), made)
+    refused((lambda: frames[3], None), error=IndexError)
 
 
 def test_archive_round_trip_keeps_counts_and_empty_frames(tmp_path):
     made = clouds(5, 0, 7)
     assert save_frames(tmp_path / "a.npz", made) == [tmp_path / "a.npz"]
-    frames = load_frames(tmp_path / "a.npz")
+    frames = tr.load_frames(tmp_path / "a.npz")
     assert same(frames, made)
     assert frames.names[2] == f"{tmp_path / 'a.npz'}, frame 2"
-    assert same(load_frames([tmp_path / "a.npz"]), made)
+    assert same(tr.load_frames([tmp_path / "a.npz"]), made)
     with np.load(tmp_path / "a.npz") as stored:
         assert stored["points"].shape == (3, 7, 3)
         assert stored["points"].dtype == np.float32
         assert stored["counts"].tolist() == [5, 0, 7]
-
-
-def test_a_folder_with_one_archive_and_frames_all_empty(tmp_path):
+    frames[0].zero_()
+    assert float(frames[0].abs().sum()) > 0  # frames are copies of the file
     save_frames(tmp_path / "a.npz", [torch.zeros(0, 3)])
-    frames = load_frames(tmp_path)
-    assert frames[0].shape == (0, 3)
+    assert tr.load_frames(tmp_path)[0].shape == (0, 3)  # a folder with one archive
 
 
-def test_double_precision_survives_when_asked_for(tmp_path):
+@pytest.mark.parametrize("place", ["a.npz", "b"])
+def test_double_precision_survives_when_asked_for(tmp_path, place):
     made = clouds(4, 6, dtype=torch.float64)
-    for place in (tmp_path / "a.npz", tmp_path / "b"):
-        save_frames(place, made)
-        assert same(load_frames(place, dtype=torch.float64), made)
-        assert same(load_frames(place), [cloud.float() for cloud in made])
+    save_frames(tmp_path / place, made)
+    assert same(tr.load_frames(tmp_path / place, dtype=torch.float64), made)
+    assert same(tr.load_frames(tmp_path / place), [cloud.float() for cloud in made])
 
 
 def test_frames_are_read_when_asked_for(tmp_path):
     files = save_frames(tmp_path / "frames", clouds(5, 3, 4))
-    frames = load_frames(files)
+    frames = tr.load_frames(files)
     files[1].write_bytes(b"ply\nnot a ply at all")
     files[2].unlink()
     assert len(frames[0]) == 5
-    with pytest.raises(FormatError, match=r"frame_0001\.ply"):
-        frames[1]
-    with pytest.raises(FileNotFoundError, match=r"frame_0002\.ply"):
-        frames[2]
+    refused((lambda: frames[1], r"frame_0001\.ply"))
+    refused((lambda: frames[2], r"frame_0002\.ply"), error=FileNotFoundError)
     save_points(files[1], clouds(9)[0])
     assert len(frames[1]) == 9
 
@@ -87,10 +92,18 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     names = ["frame1.ply", "frame2.ply", "frame10.ply", "frame11.ply"]
     for name, cloud in zip(names, made, strict=True):
         save_points(tmp_path / name, cloud)
-    assert same(load_frames(tmp_path), made)
+    assert same(tr.load_frames(tmp_path), made)
     as_a_shell_lists_them = [tmp_path / name for name in sorted(names)]
-    assert same(load_frames(as_a_shell_lists_them), made)
-    assert same(load_frames(tuple(as_a_shell_lists_them), sort=False), [made[0], made[2], made[3], made[1]])
+    assert same(tr.load_frames(as_a_shell_lists_them), made)
+    assert same(tr.load_frames(tuple(as_a_shell_lists_them), sort=False), [made[0], made[2], made[3], made[1]])
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for time in (0.3, 0.05, 0.25, 0.1):
+            (tmp_path / side / f"t={time}.png").touch()
+    assert [path.name for path in list_pictures(tmp_path / "left")] == [f"t={t}.png" for t in (0.05, 0.1, 0.25, 0.3)]
+    (tmp_path / "left" / "t=0.05.png").rename(tmp_path / "left" / "t=5e-2.png")
+    first = list_frames([tmp_path / "left", tmp_path / "right"])[0]
+    assert [path.name for path in first] == ["t=5e-2.png", "t=0.05.png"]
 
 
 @settings(max_examples=50, deadline=None)
@@ -98,138 +111,135 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
 def test_natural_order_sorts_by_text_then_number(pairs):
     names = [f"{text}{number}.ply" for text, number in pairs]
     # Of the texts, "run3/" is last and so no digit of it meets another's number.
-    assert sorted(names, key=natural_key) == [f"{text}{number}.ply" for text, number in sorted(pairs)]
+    assert natural_sorted(names) == [f"{text}{number}.ply" for text, number in sorted(pairs)]
 
 
-def test_one_file_is_one_frame(tmp_path):
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["frame_0.5.xyz", "frame_1.0.xyz", "frame_1.25.xyz", "frame_1.5.xyz", "frame_10.0.xyz"],
+        ["t=0.05.png", "t=0.1.png", "t=0.25.png", "t=0.3.png"],
+        ["t=-2.ply", "t=-0.5.ply", "t=0.ply", "t=1.ply"],
+        ["scan-2.ply", "scan-9.ply", "scan-10.ply"],
+        ["2024.01.15.ply", "2024.02.01.ply", "2024.10.01.ply"],
+        ["take1.1.ply", "take1.2.ply", "take1.10.ply", "take1.100.ply", "take2.1.ply"],
+        ["walk.1.ply", "walk.2.ply", "walk.10.ply"],
+        ["a1b2.ply", "a1b10.ply", "a2b1.ply"],
+        ["9.ply", "10.ply", "10a.ply", "b.ply"],
+        ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
+        ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
+        ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
+        ["3e-9f.ply", "3e-10f.ply"],
+        ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
+        ["v1.2.9.ply", "v1.2.10.ply", "v1.10.1.ply"],
+    ],
+)
+def test_names_sort_as_a_person_would(names):
+    assert natural_sorted(reversed(names)) == names
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.xyz", "a.npz"])
+def test_one_file_is_one_frame(tmp_path, name):
     (cloud,) = clouds(6)
-    for name in ("a.ply", "a.xyz", "a.npz"):
-        save_points(tmp_path / name, cloud)
-        frames = load_frames(tmp_path / name, dtype=torch.float64)
-        assert len(frames) == 1
-        torch.testing.assert_close(frames[0].float(), cloud)
+    save_points(tmp_path / name, cloud)
+    (frame,) = tr.load_frames(tmp_path / name, dtype=torch.float64)
+    torch.testing.assert_close(frame.float(), cloud)
 
 
 @pytest.mark.parametrize("name", ["points", "vertices", "whatever"])
 def test_stacks_of_other_programs(tmp_path, name):
     stack = np.random.default_rng(0).normal(size=(3, 4, 3))
-    np.savez(tmp_path / "s.npz", **{name: stack, "faces": np.zeros((2, 3), int), "names": np.array(["x", "y"])})
-    frames = load_frames(tmp_path / "s.npz", dtype=torch.float64)
-    np.testing.assert_array_equal(np.stack([frame.numpy() for frame in frames]), stack)
+    path = archived(tmp_path, **{name: stack, "faces": np.zeros((2, 3), int), "names": np.array(["x", "y"])})
+    np.testing.assert_array_equal(torch.stack(list(tr.load_frames(path, dtype=torch.float64))), stack)
+    np.save(tmp_path / "s.npy", stack)
+    frames = tr.load_frames(tmp_path / "s.npy", scale=0.5, dtype=torch.float64)
+    np.testing.assert_array_equal(torch.stack(list(frames)), stack / 2)
+    assert frames.names[1].endswith("s.npy, frame 1")
 
 
 def test_masks_counts_and_packed_archives(tmp_path):
-    stack = np.arange(24.0).reshape(2, 4, 3)
-    mask = np.array([[True, False, True, False], [False] * 4])
+    stack, mask = np.arange(24.0).reshape(2, 4, 3), np.array([[True, False, True, False], [False] * 4])
     np.savez_compressed(tmp_path / "m.npz", points=stack, mask=mask)
-    frames = load_frames(tmp_path / "m.npz", dtype=torch.float64)
+    frames = tr.load_frames(tmp_path / "m.npz", dtype=torch.float64)
     np.testing.assert_array_equal(frames[0].numpy(), stack[0, [0, 2]])
     assert frames[1].shape == (0, 3)
-    np.savez(tmp_path / "c.npz", points=stack.astype(">f4"), counts=np.array([1.0, 4.0]))
-    assert [len(frame) for frame in load_frames(tmp_path / "c.npz")] == [1, 4]
+    path = archived(tmp_path, points=stack.astype(">f4"), counts=np.array([1.0, 4.0]))
+    assert [len(frame) for frame in tr.load_frames(path)] == [1, 4]
 
 
-def test_arrays_per_frame(tmp_path):
-    made = {f"frame_{number}": np.full((number + 1, 3), float(number)) for number in range(12)}
-    np.savez(tmp_path / "f.npz", **made, fps=20)
-    frames = load_frames(tmp_path / "f.npz")
-    assert [len(frame) for frame in frames] == list(range(1, 13))
-    assert all(bool((frame == number).all()) for number, frame in enumerate(frames))
-
-
-@pytest.mark.parametrize("name", ["arr_{}", "cloud{}", "{}"])
-def test_lists_as_numpy_saves_them_are_in_order_of_their_numbers(tmp_path, name):
+@pytest.mark.parametrize("name", ["frame_{}", "arr_{}", "cloud{}", "{}"])
+def test_lists_of_arrays_are_in_order_of_their_numbers(tmp_path, name):
     made = clouds(*range(50, 62))
-    np.savez(tmp_path / "f.npz", **{name.format(number): cloud.numpy() for number, cloud in enumerate(made)})
-    assert same(load_frames(tmp_path / "f.npz"), made)
+    path = archived(tmp_path, **{name.format(number): cloud.numpy() for number, cloud in enumerate(made)}, fps=20)
+    assert same(tr.load_frames(path), made)
 
 
 def test_numbered_arrays_of_one_cloud_are_no_frames(tmp_path):
     points = clouds(20)[0].numpy()
-    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
-    for other in (normals, np.array([[0, 1, 2]])):
-        np.savez(tmp_path / "f.npz", points, other)
-        assert len(load_frames(tmp_path / "f.npz")) == 1
+    for other in (points / np.linalg.norm(points, axis=1, keepdims=True), np.array([[0, 1, 2]])):
+        assert len(tr.load_frames(archived(tmp_path, arr_0=points, arr_1=other))) == 1
 
 
 @pytest.mark.parametrize(("vertices", "faces"), [("verts", "faces"), ("vertices", "f"), ("v", "f")])
 def test_bodies_of_one_topology_are_meshes(tmp_path, vertices, faces):
     stack = np.random.default_rng(0).normal(size=(3, 5, 3)).astype("f4")
-    np.savez(tmp_path / "b.npz", **{vertices: stack, faces: np.array([[0, 1, 2, 3], [2, 3, 4, 0]], "u4")})
-    frames = load_frames(tmp_path / "b.npz", scale=0.5)
+    path = archived(tmp_path, **{vertices: stack, faces: np.array([[0, 1, 2, 3], [2, 3, 4, 0]], "u4")})
+    frames = tr.load_frames(path, scale=0.5)
     assert torch.equal(frames[1], torch.from_numpy(stack[1]) / 2)
     meshes = frames[1:].clouds()
     assert len(meshes) == 2
     assert torch.equal(meshes[1].points, frames[2])
     assert meshes[1].faces.tolist() == [[0, 1, 2], [0, 2, 3], [2, 3, 4], [2, 4, 0]]
-    np.savez(tmp_path / "one.npz", **{vertices: stack[0], faces: [[0, 1, 2]]})
-    assert load_mesh(tmp_path / "one.npz").num_faces == 1
-    with pytest.raises(FormatError, match="load_frames reads it as a sequence"):
-        load_points(tmp_path / "b.npz")
+    refused((lambda: tr.load_points(path), "load_frames reads it as a sequence"))
+    assert tr.load_mesh(archived(tmp_path, **{vertices: stack[0], faces: [[0, 1, 2]]})).num_faces == 1
 
 
 def test_frames_that_are_not_finite(tmp_path):
     stack = np.ones((2, 3, 3))
     stack[1, 1, 2], stack[1, 2] = np.nan, np.inf
-    np.savez(tmp_path / "n.npz", points=stack)
-    frames = load_frames(tmp_path / "n.npz")
-    assert len(frames[0]) == 3
-    with pytest.raises(FormatError, match=r"n\.npz, frame 1: 2 of 3 points are not finite"):
-        frames[1]
-    assert len(load_frames(tmp_path / "n.npz", nan_policy="omit")[1]) == 1
-    (tmp_path / "f").mkdir()
-    (tmp_path / "f" / "a.xyz").write_text("0 0 0\nnan 0 0\n")
-    assert len(load_frames(tmp_path / "f", nan_policy="omit")[0]) == 1
+    path = archived(tmp_path, points=stack)
+    assert len(tr.load_frames(path)[0]) == 3
+    refused((lambda: tr.load_frames(path)[1], r"s\.npz, frame 1: 2 of 3 points are not finite"))
+    assert len(tr.load_frames(path, nan_policy="omit")[1]) == 1
+    assert len(tr.load_frames(put(tmp_path, "a.xyz", "0 0 0\nnan 0 0\n"), nan_policy="omit")[0]) == 1
 
 
-def test_frames_are_read_only_copies_of_the_file(tmp_path):
-    save_frames(tmp_path / "a.npz", clouds(5))
-    frames = load_frames(tmp_path / "a.npz")
-    frames[0].zero_()
-    assert float(frames[0].abs().sum()) > 0
+STACK = np.zeros((2, 4, 3))
 
 
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"points": np.zeros((2, 4, 2))}, r"frame 0 must have shape \(M, 3\), got \(4, 2\)"),
-        ({"points": np.zeros((0, 4, 3))}, "holds no frames"),
-        ({"points": np.zeros((2, 4, 3)), "counts": [1, 5]}, "counts must be 2 numbers from 0 to 4"),
-        ({"points": np.zeros((2, 4, 3)), "counts": [1]}, "counts must be 2 numbers"),
-        ({"points": np.zeros((2, 4, 3)), "counts": [1.5, 2]}, "counts must be whole numbers"),
-        ({"points": np.zeros((2, 4, 3)), "mask": np.ones((2, 3), bool)}, r"mask must have the shape \(2, 4\)"),
-        ({"points": np.zeros((2, 4, 3)), "mask": np.ones((2, 4))}, "'mask' must hold truth values"),
-        ({"points": np.zeros((2, 4, 3)), "mask": np.ones((2, 4), bool), "counts": [1, 2]}, "not both"),
-        ({"points": np.zeros((2, 4, 3), complex)}, "'points' must hold real numbers"),
+        ({"points": STACK[..., :2]}, r"frame 0 must have shape \(M, 3\), got \(4, 2\)"),
+        ({"points": STACK[:0]}, "holds no frames"),
+        ({"points": STACK, "counts": [1, 5]}, "counts must be 2 numbers from 0 to 4"),
+        ({"points": STACK, "counts": [1]}, "counts must be 2 numbers"),
+        ({"points": STACK, "counts": [1.5, 2]}, "counts must be whole numbers"),
+        ({"points": STACK, "mask": np.ones((2, 3), bool)}, r"mask must have the shape \(2, 4\)"),
+        ({"points": STACK, "mask": np.ones((2, 4))}, "'mask' must hold truth values"),
+        ({"points": STACK, "mask": np.ones((2, 4), bool), "counts": [1, 2]}, "not both"),
+        ({"points": STACK.astype(complex)}, "'points' must hold real numbers"),
         ({"points": np.full((2, 4, 3), None)}, "pickled objects are never loaded"),
-        ({"frame_0": np.zeros((4, 3)), "frame_1": np.zeros((4, 2))}, "frame 1 must have shape"),
+        ({"frame_0": STACK[0], "frame_1": STACK[0, :, :2]}, "frame 1 must have shape"),
     ],
 )
 def test_archives_that_are_refused(tmp_path, arrays, message):
-    np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(FormatError, match=rf"bad\.npz: .*{message}"):
-        load_frames(tmp_path / "bad.npz")
+    path = archived(tmp_path, **arrays)
+    refused((lambda: tr.load_frames(path), rf"s\.npz: .*{message}"))
 
 
-def test_an_array_that_claims_more_than_it_holds(tmp_path):
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6, 3)})
+def test_archives_that_are_none_or_claim_more_than_they_hold(tmp_path):
+    for content in (b"", b"PK\x03\x04 cut off", b"\x00" * 100):
+        path = put(tmp_path, "x.npz", content)
+        refused((lambda path=path: tr.load_frames(path), r"x\.npz: "))
     with zipfile.ZipFile(tmp_path / "big.npz", "w") as archive:
-        archive.writestr("points.npy", stream.getvalue() + bytes(24))
-    with pytest.raises(FormatError, match=r"claims the shape \(1000000, 1000000, 3\)"):
-        load_frames(tmp_path / "big.npz")
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"\x00" * 100])
-def test_archives_that_are_none(tmp_path, content):
-    (tmp_path / "x.npz").write_bytes(content)
-    with pytest.raises(FormatError, match=r"x\.npz: "):
-        load_frames(tmp_path / "x.npz")
+        archive.writestr("points.npy", header("(1000000, 1000000, 3)", "'<f8'"))
+    refused((lambda: tr.load_frames(tmp_path / "big.npz"), r"claims the shape \(1000000, 1000000, 3\)"))
 
 
 def readable_or_named(path):
     try:
-        return all(frame.shape[1] == 3 for frame in load_frames(path, nan_policy="omit"))
+        return all(frame.shape[1] == 3 for frame in tr.load_frames(path, nan_policy="omit"))
     except FormatError as error:
         return path.name in str(error)
 
@@ -238,75 +248,84 @@ def test_damaged_archives_name_the_file(tmp_path):
     save_frames(tmp_path / "a.npz", clouds(5, 6))
     content = (tmp_path / "a.npz").read_bytes()
     for place in range(0, len(content), 7):
-        (tmp_path / "b.npz").write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
-        assert readable_or_named(tmp_path / "b.npz"), place
+        damaged = content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :]
+        assert readable_or_named(put(tmp_path, "b.npz", damaged)), place
 
 
 def test_limits_hold_for_archives_and_files(tmp_path):
     save_frames(tmp_path / "a.npz", clouds(5, 6))
-    with pytest.raises(FormatError, match=r"a\.npz: claims 6 points, allowed are 0 to 5"):
-        load_frames(tmp_path / "a.npz", limits=FileLimits(max_points=5))
-    with pytest.raises(FormatError, match="the limit is 100"):
-        load_frames(tmp_path / "a.npz", limits=FileLimits(max_bytes=100))
-    frames = load_frames(save_frames(tmp_path / "f", clouds(5, 6)), limits=FileLimits(max_points=5))
+    five, path = FileLimits(max_points=5), tmp_path / "a.npz"
+    frames = tr.load_frames(save_frames(tmp_path / "f", clouds(5, 6)), limits=five)
     assert len(frames[0]) == 5
-    with pytest.raises(FormatError, match=r"frame_0001\.ply: claims 6 points"):
-        frames[1]
+    refused(
+        (lambda: frames[1], r"frame_0001\.ply: claims 6 points"),
+        (lambda: tr.load_frames(path, limits=five), r"a\.npz: claims 6 points, allowed are 0 to 5"),
+        (lambda: tr.load_frames(path, limits=FileLimits(max_bytes=100)), "the limit is 100"),
+    )
 
 
-def test_what_cannot_be_loaded(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.ply"):
-        load_frames(tmp_path / "none.ply")
-    with pytest.raises(FormatError, match="holds no frames: no file ends in one of"):
-        load_frames(tmp_path)
-    with pytest.raises(FormatError, match="empty list"):
-        load_frames([])
-    with pytest.raises(IsADirectoryError, match="pass it alone"):
-        load_frames([tmp_path])
-    with pytest.raises(FormatError, match="is an address"):
-        load_frames("https://example.org/frames")
-    with pytest.raises(InputTypeError, match="path must be a path or a list of paths, got int"):
-        load_frames(3)
-    with pytest.raises(InputTypeError, match="dtype must be"):
-        load_frames(tmp_path, dtype=torch.float16)
-    with pytest.raises(InputError, match="nan_policy must be one of"):
-        load_frames(tmp_path, nan_policy="ignore")
-    (tmp_path / "notes.md").write_text("no cloud")
-    with pytest.raises(FormatError, match=r"unknown ending '\.md'"):
-        load_frames(tmp_path / "notes.md")
+@pytest.mark.parametrize(
+    ("path", "options", "error", "words"),
+    [
+        ("none.ply", {}, FileNotFoundError, r"none\.ply"),
+        (".", {}, FormatError, "holds no frames: no file ends in one of"),
+        ([], {}, FormatError, "empty list"),
+        (["."], {}, IsADirectoryError, "pass it alone"),
+        ("https://example.org/frames", {}, FormatError, "is an address"),
+        (3, {}, tr.errors.InputTypeError, "path must be a path or a list of paths, got int"),
+        (".", {"dtype": torch.float16}, tr.errors.InputTypeError, "dtype must be"),
+        (".", {"nan_policy": "ignore"}, InputError, "nan_policy must be one of"),
+        ("notes.md", {}, FormatError, r"unknown ending '\.md'"),
+    ],
+)
+def test_what_cannot_be_loaded(tmp_path, monkeypatch, path, options, error, words):
+    monkeypatch.chdir(tmp_path)
+    put(tmp_path, "notes.md", "no cloud")
+    with pytest.raises(error, match=words):
+        tr.load_frames(path, **options)
 
 
 def test_folders_leave_other_files_alone_but_mix_no_formats(tmp_path):
     made = clouds(2, 3)
     save_frames(tmp_path, made)
-    (tmp_path / "readme.md").write_text("no cloud")
-    (tmp_path / ".frame_0009.ply").write_text("hidden")
-    assert same(load_frames(tmp_path), made)
+    put(tmp_path, "readme.md", "no cloud")
+    put(tmp_path, ".frame_0009.ply", "hidden")
+    assert same(tr.load_frames(tmp_path), made)
+    put(tmp_path, "times.csv", "frame,time\n0,0\n")
+    words = r"its 2 \.ply files are the frames; times\.csv beside them are passed over"
+    with pytest.warns(tr.errors.FileWarning, match=words):
+        assert same(tr.load_frames(tmp_path), made)
+    (tmp_path / "times.csv").unlink()
     save_points(tmp_path / "extra.xyz", made[0])
-    with pytest.raises(FormatError, match=r"several formats \(2 \.ply, 1 \.xyz\)"):
-        load_frames(tmp_path)
+    refused((lambda: tr.load_frames(tmp_path), r"several formats \(2 \.ply, 1 \.xyz\)"))
 
 
-def test_what_cannot_be_saved(tmp_path):
-    with pytest.raises(InputError, match="at least one cloud"):
-        save_frames(tmp_path / "a.npz", [])
-    with pytest.raises(InputError, match=r"frames\[1\] must have shape \(M, 3\), got \(2, 2\)"):
-        save_frames(tmp_path / "a.npz", [torch.zeros(2, 3), torch.zeros(2, 2)])
-    with pytest.raises(InputError, match=r"frames\[0\] must be finite"):
-        save_frames(tmp_path / "a.npz", [torch.full((1, 3), torch.nan)])
-    with pytest.raises(InputError, match=r"frames\[1\] has no points"):
-        save_frames(tmp_path / "f", clouds(2, 0))
-    with pytest.raises(FormatError, match=r"ending '\.ply'"):
-        save_frames(tmp_path / "a.ply", clouds(2))
-    with pytest.raises(FileNotFoundError):
-        save_frames(tmp_path / "no" / "f", clouds(2))
-    assert list(Path(tmp_path).iterdir()) == []
+@pytest.mark.parametrize(
+    ("name", "frames", "error", "words"),
+    [
+        ("a.npz", [], InputError, "at least one cloud"),
+        (
+            "a.npz",
+            [torch.zeros(2, 3), torch.zeros(2, 2)],
+            InputError,
+            r"frames\[1\] must have shape \(M, 3\), got \(2, 2\)",
+        ),
+        ("a.npz", [torch.full((1, 3), torch.nan)], InputError, r"frames\[0\] must be finite"),
+        ("f", clouds(2, 0), InputError, r"frames\[1\] has no points"),
+        ("a.ply", clouds(2), FormatError, r"ending '\.ply'"),
+        ("no/f", clouds(2), FileNotFoundError, None),
+    ],
+)
+def test_what_cannot_be_saved(tmp_path, name, frames, error, words):
+    with pytest.raises(error, match=words):
+        save_frames(tmp_path / name, frames)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_shorter_sequence_is_not_mixed_into_a_longer_one(tmp_path):
     save_frames(tmp_path / "f", clouds(2, 2, 2))
     made = clouds(3, 3, 3, seed=1)
     save_frames(tmp_path / "f", made)
-    assert same(load_frames(tmp_path / "f"), made)
-    with pytest.raises(InputError, match=r"holds 1 other point files, such as frame_0002\.ply"):
-        save_frames(tmp_path / "f", made[:2])
+    assert same(tr.load_frames(tmp_path / "f"), made)
+    words = r"holds 1 other point files, such as frame_0002\.ply"
+    refused((lambda: save_frames(tmp_path / "f", made[:2]), words), error=InputError)

@@ -109,7 +109,7 @@ def _measured(paths: list[Path], views: DepthOptions, scale: float, result: Any)
     """Return clouds, meshes or depth pictures as the command had them that wrote the result."""
     from torchreg.cli.track_run import Clouds
     from torchreg.cli.view import read_frames
-    from torchreg.spines.surfaces import FrameSurfaces
+    from torchreg.spines.frames.frame_surfaces import FrameSurfaces
 
     kind = type(result).__name__
     if kind not in ("TrackResult", "SpineSequence"):

@@ -174,11 +174,12 @@ def track(
     model = fitted_shape(model, fit_shape)
     with claimed(result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
         tracker = Tracker(model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape)
-        run = TrackRun(tracker, clouds, fps, job, files, Report(bar, clouds, quiet), save_every, given, direction)
-        if cameras.stereo:
-            run.seen = _drawn_pictures(source, folder)
-        if view:
-            run.live = _live_page(pages, port, browser, quiet, direction)
+        run = TrackRun(
+            tracker, clouds, fps, job, files, report=Report(bar, clouds, quiet), save_every=save_every, known=given,
+            up=direction,
+        )  # fmt: skip
+        run.seen = _drawn_pictures(source, folder) if cameras.stereo else None
+        run.live = _live_page(pages, port, browser, quiet, direction) if view else None
         complete = run.run(resumed)
     _report_end(run, model, complete, quiet)
 
