@@ -30,7 +30,7 @@ import torchreg as tr
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.bones.correspondences import Correspondences
-from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
+from torchreg.registration.bones.motion_problem import BoneProblem
 from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.bones.weights import refine_weights
@@ -100,8 +100,7 @@ def measure(bones: int, dtype: torch.dtype, scale: float, repeats: int) -> list[
         binary = torch.nn.functional.one_hot(weights.argmax(-1), bones).to(points)
         pairs = Correspondences(targets, tube.normals[few], torch.ones_like(targets[:, 0]), 0.0)
         for name, shares in (("binary", binary), ("blended", weights)):
-            bodies = BoneBodies.from_weights(points[few], shares)
-            problem = BoneProblem(points[few], Binding.from_weights(shares), pairs, bodies, moments)
+            problem = BoneProblem.of_weights(points[few], shares, pairs, moments=moments)
             rows.append((f"T-step, {name}", milliseconds(lambda p=problem: fit_bones(p, bent, max_steps=1), repeats)))
     rows += refinement_rows(tube, few[: int(1500 * scale)], max(1, repeats // 10))
     return rows + pose_rows(tube, repeats)

@@ -1,4 +1,4 @@
-"""Captured motion, given as meshes that share vertices, scanned from one side by a made-up depth camera."""
+"""Scans from files: pairs, and captured motion of meshes that share vertices before a made-up depth camera."""
 
 from __future__ import annotations
 
@@ -51,6 +51,14 @@ class CapturedSequence(Sequence[tr.RangeScan]):
         meshes = [TriangleMesh(vertices, self.faces) for vertices in self.vertices]
         view, generator = self.scanner.view(meshes[0], REACH), torch.Generator().manual_seed(self.seed)
         return [self.scanner.scan(mesh, view, generator, torch.float32) for mesh in meshes]
+
+
+def scan_pairs(folder: Path) -> Iterator[tuple[str, tr.RangeScan, tr.RangeScan, Tensor, float]]:
+    """Yield the pairs of NPZ files by name: source, target, true positions (N, 3) of the source's points, diagonal."""
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as file:
+            source, target = (tr.RangeScan(file[f"{end}_points"], file[f"{end}_faces"]) for end in ("source", "target"))
+            yield path.stem, source, target, torch.from_numpy(file["source_truth"]), float(file["diagonal"])
 
 
 def captured_sequences(

@@ -37,6 +37,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
+from confidence import area_under_curve
 from depth_frames import REACH, marked_tips
 from find_pose import seen_tips
 from torch import Tensor
@@ -105,12 +106,6 @@ def tip_errors(hand: tr.Hand, found: Tensor, poses: Tensor) -> Tensor:
     return (hand.keypoints(found) - hand.keypoints(poses))[:, TIPS].norm(dim=-1).mean(-1)
 
 
-def auroc(confidence: Tensor, right: Tensor) -> float:
-    """Return how often a right cloud is surer than a wrong one; NaN where all are right or all wrong."""
-    gaps = confidence[right].unsqueeze(-1) - confidence[~right]
-    return float(((gaps > 0).double() + 0.5 * (gaps == 0)).mean())
-
-
 def auroc_error(area: float, num_right: int, num_wrong: int) -> float:
     """Return the standard error of an AUROC. References: Hanley and McNeil 1982."""
     if not num_right or not num_wrong:
@@ -168,7 +163,7 @@ def from_scratch(
     found = layer(clouds)
     seconds, error = now(device) - begin, tip_errors(hand, found.pose, poses)
     right = error <= RIGHT
-    area, num_right = auroc(found.confidence, right), int(right.sum())
+    area, num_right = area_under_curve(found.confidence, right), int(right.sum())
     share = num_right / count
     figures = {
         "clouds": float(count),
@@ -235,7 +230,7 @@ def proposed(hand: tr.Hand, count: int, generator: torch.Generator, device: torc
         "per_second": count / wall,
         "median_mm": 1e3 * float(error.median()),
         "right": float(right.double().mean()),
-        "auroc": auroc(found.confidence, right),
+        "auroc": area_under_curve(found.confidence, right),
         "sure": float(sure.double().mean()),
         "right_if_sure": float(right[sure].double().mean()),
     }

@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
+from captured_scans import scan_pairs
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -71,14 +71,6 @@ class Score:
         return self.near >= REGISTERED
 
 
-def file_pairs(folder: Path) -> Iterator[Pair]:
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as file:
-            source = tr.RangeScan(file["source_points"], file["source_faces"])
-            target = tr.RangeScan(file["target_points"], file["target_faces"])
-            yield Pair(path.stem, source, target, torch.from_numpy(file["source_truth"]), float(file["diagonal"]))
-
-
 def made_up_pairs(name: str, sequence: ScanSequence, count: int, apart: int) -> Iterator[Pair]:
     """Yield pairs of frames ``apart``, spread over the sequence."""
     for start in torch.linspace(0, len(sequence) - 1 - apart, count).long().tolist():
@@ -89,7 +81,7 @@ def made_up_pairs(name: str, sequence: ScanSequence, count: int, apart: int) -> 
 def groups(folder: Path | None, count: int, smoke: bool) -> Iterator[tuple[str, Iterator[Pair]]]:
     """Yield names and pairs."""
     if folder is not None and any(folder.glob("*.npz")):
-        yield folder.name, file_pairs(folder)
+        yield folder.name, (Pair(*pair) for pair in scan_pairs(folder))
     animal = Proportions.random(torch.Generator().manual_seed(1), 0.2)
     scanner = DepthScanner(num_points=800) if smoke else DepthScanner()
     sequences = {

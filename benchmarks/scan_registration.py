@@ -35,7 +35,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from captured_scans import CapturedSequence, captured_sequences
+from captured_scans import CapturedSequence, captured_sequences, scan_pairs
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -140,15 +140,6 @@ def _ablations() -> list[Recipe]:
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
-
-
-def file_problems(folder: Path) -> Iterator[Problem]:
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as file:
-            source = tr.RangeScan(file["source_points"], file["source_faces"])
-            target = tr.RangeScan(file["target_points"], file["target_faces"])
-            truth, diagonal = torch.from_numpy(file["source_truth"]), float(file["diagonal"])
-        yield Problem(path.stem, source, target, truth, diagonal)
 
 
 def made_up_problems(kind: str, count: int, num_points: int = 4500, apart: int = 1) -> Iterator[Problem]:
@@ -411,7 +402,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.data is None or not options.data.is_dir():
         print("skipped: pairs from files; name their folder with --data")
     else:
-        sets[options.data.name] = list(file_problems(options.data))
+        sets[options.data.name] = [Problem(*pair) for pair in scan_pairs(options.data)]
     if options.pairs:
         sets |= {kind: list(made_up_problems(kind, options.pairs)) for kind in ("figure", "toy")}
         # Between adjacent frames many parts hardly move: parts can be told where they do.

@@ -53,13 +53,14 @@ class Break:
     file: Path
     function: str
     original: str
+    number: int
     start: tuple[int, int]
     end: tuple[int, int]
     text: str
 
     def rank(self, seed: int) -> str:
         """Return a number drawn for the place, which moving its function to another file does not change."""
-        return hashlib.sha256(f"{seed} {self.function} {self.original} {self.text}".encode()).hexdigest()
+        return hashlib.sha256(f"{seed} {self.function} {self.original} {self.number}".encode()).hexdigest()
 
     @property
     def room(self) -> str:
@@ -77,13 +78,17 @@ class Break:
 def breaks_of(file: Path, root: Path) -> Iterator[Break]:
     """Yield all breaks of the functions of a file."""
     source = (root / file).read_text()
-    tree = ast.parse(source)
+    tree, numbers = ast.parse(source), Counter[tuple[str, str]]()
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
         for node in (inner for statement in function.body for inner in ast.walk(statement)):
             pair = replacement(node, source)
             if pair is not None:
                 place, text = pair
-                yield Break(file, function.name, ast.dump(node), (place[0], place[1]), (place[2], place[3]), text)
+                numbers[function.name, ast.dump(node)] += 1
+                number = numbers[function.name, ast.dump(node)]
+                yield Break(
+                    file, function.name, ast.dump(node), number, (place[0], place[1]), (place[2], place[3]), text
+                )
 
 
 def replacement(node: ast.AST, source: str) -> tuple[tuple[int, int, int, int], str] | None:

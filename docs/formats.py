@@ -9,47 +9,45 @@ HEAD = """# File formats
 
 `torchreg formats` prints this table, which is made from the readers themselves (`python docs/formats.py`).
 
-A format is told by what a file holds; where that does not tell, by its ending. So a PLY file that is called
-`scan.obj` is read as what it is. Clouds, meshes and tables may be packed by gzip (`scan.ply.gz`). Byte order marks
-do no harm, nor does text that Windows wrote in UTF-16.
+The content of a file decides its format, and the ending only if the content is ambiguous. So a PLY file with the name
+`scan.obj` is read as PLY. Clouds, meshes and tables may be compressed by gzip (`scan.ply.gz`). Byte order marks and
+UTF-16 text from Windows are accepted.
 
 """
 TAIL = """
-## What is read out of tables
+## Tables
 
 The first line of a table of points may name its columns (`X,Y,Z,R,G,B`, `x [m];y [m];z [m]`, `Points:0,...`, also
-behind `//` or `#`), or hold the number of points alone. Without names x, y, z come first, and what follows is told
-by its numbers: unit vectors are normals; whole numbers up to 255 or 65535, or numbers from 0 to 1, are colors; the
-rest is passed over, as intensity and time are. Numbers may have decimal commas where semicolons, tabs or blanks
-stand between the columns, in tables of poses too.
+after `//` or `#`), or hold only the number of points. Without names x, y, z come first, and their values identify the
+other columns: unit vectors are normals; integers up to 255 or 65535, or numbers from 0 to 1, are colors; others, such
+as intensity and time, are ignored. Decimal commas are accepted if semicolons, tabs or blanks separate the columns.
+The same holds for tables of poses.
 
-## What is put right, and what is told
+## Corrections and warnings
 
-* Coordinates far from the origin, as in maps, are read in double precision, and every system computes about an
-  origin near them, which results tell as `origin`. What they return is in the coordinates of the file.
-* `scale=0.001` (`--scale 0.001`) reads millimeters as metres. Data and shape whose sizes differ by more than
-  thirtyfold, two scans by more than sevenfold, and links, joints or slides of a robot that are in another unit than
-  the rest give a warning that names the factor.
-* A skinned glTF mesh stands as viewers show it: in the pose of its nodes, or at `time=` or `frame=` of its
-  animation.
-* Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`, and `5e-05` before `0.0001`.
-* Rows `0 0 0` of clouds, as depth cameras, scanners and padded stacks leave where nothing was measured, are left out
-  with a warning that counts them, once for a sequence. A single one stays, as a point may be the origin, and so do
+* Coordinates far from the origin, as in maps, are read in double precision. Every system computes relative to an
+  origin near them (`origin` of the result) and returns the coordinates of the file.
+* `scale=0.001` (`--scale 0.001`) converts millimeters to metres. A warning names the factor if the sizes of data and
+  shape differ by more than thirtyfold, those of two scans by more than sevenfold, or if links, joints or slides of a
+  robot have another unit than the rest.
+* A skinned glTF mesh is posed as viewers show it: by its nodes, or at `time=` or `frame=` of its animation.
+* Files are sorted by the numbers in their names: `0.5, 1.25, 1.5, 10`, and `5e-05` before `0.0001`.
+* Depth cameras, scanners and padded stacks write rows `0 0 0` where nothing was measured. Such rows of clouds are
+  removed, with one warning that counts them. A single such row stays, because a point may be the origin, and so do
   corners of faces.
-* In a mask the brighter of two values is set, whatever they are; transparency that varies is the mask; in a picture
-  of labels all but zero is set; soft edges are cut at half of the white, and so are halos of one value around it,
-  with a warning.
-* Whole numbers in depth images are millimeters, floating-point ones metres, unless the camera's file says otherwise:
+* In a mask of two values the brighter one is set. Varying transparency is the mask. In a picture of labels everything
+  but zero is set. Soft edges are cut at half of the white; so are halos of one value around it, with a warning.
+* Integers in depth images are millimeters, floating-point numbers metres, unless the file of the camera has a unit:
   `depth_scale`, `depth_units` (metres per unit), `depth_factor`, `png_depth_scale`, `DepthMapFactor` (units per
-  metre); 65535 is no depth.
-* Lenses of other kinds than a pinhole camera's (fisheye, equidistant, Kannala-Brandt, omnidirectional) are refused
-  under every name that programs have for them; so are four numbers without a model that are hardly k1 k2 p1 p2.
-* Of ROS's camera_info K and D are those of the raw picture; where D is zero P holds. P tells where the right camera
-  of a pair stands: a folder with `left.yaml` and `right.yaml` is a pair.
-* A piece of a file that cannot be used is left out with a warning that counts it: faces of two corners, normals
-  that are not finite or of length zero, vertices without skin weight, links whose mesh is missing.
-* Files of scanners, recordings and CAD programs that are not read (E57, LAS, ROS bags, FBX, STEP and others) are
-  refused with a way to convert them.
+  metre). 65535 is no depth.
+* Lenses other than a pinhole camera's (fisheye, equidistant, Kannala-Brandt, omnidirectional) are refused under every
+  name that programs use for them. So are four numbers without a model that are implausible as k1 k2 p1 p2.
+* In ROS's camera_info, K and D belong to the raw picture; if D is zero, P is used. P holds the position of the right
+  camera of a pair: a folder with `left.yaml` and `right.yaml` is a pair.
+* Unusable parts of a file are left out, with a warning that counts them: faces with two corners, normals that are not
+  finite or of length zero, vertices without skin weights, links with a missing mesh.
+* Files of scanners, recordings and CAD programs that torchreg does not read (E57, LAS, ROS bags, FBX, STEP and
+  others) are refused, and the error names a way to convert them.
 """
 
 

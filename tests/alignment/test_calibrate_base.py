@@ -7,31 +7,15 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.base_fit import BaseProblem, fit_base
-from torchreg.alignment.base_frames import read_frames, read_joints
-from torchreg.alignment.problem import fitted_surface, model_size
-from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.rigid import rigid_matrix, transform_points
+from tests.alignment.made import ARM, offset
+from torchreg.alignment.base_frames import read_joints
+from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import sample_visible
 
-ARM = """<robot name="arm">
-  <link name="base"><visual><origin xyz="0.02 0 0.1"/><geometry><box size="0.16 0.1 0.2"/></geometry></visual></link>
-  <link name="upper"><visual><origin xyz="0.03 0 0.15"/><geometry><box size="0.06 0.09 0.3"/></geometry></visual></link>
-  <link name="lower"><visual><origin xyz="0 .04 .12"/><geometry><box size="0.05 0.07 0.24"/></geometry></visual></link>
-  <link name="tool"><visual><origin xyz="0 0.02 0.08"/><geometry><box size="0.12 0.04 0.08"/></geometry></visual></link>
-  <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.2"/>
-    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
-  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.3"/>
-    <axis xyz="0 1 0"/><limit lower="-2.2" upper="2.2" effort="1" velocity="1"/></joint>
-  <joint name="wrist" type="revolute"><parent link="lower"/><child link="tool"/><origin xyz="0 0 0.24"/>
-    <axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-</robot>"""
 JOINTS = torch.tensor([[0.3, 0.9, -0.4], [-0.8, -1.1, 0.7], [1.6, 0.5, 1.1]], dtype=torch.float64)
-BASE = rigid_matrix(
-    so3_exp(torch.tensor([[1.9, -0.4, 0.7]], dtype=torch.float64))[0], torch.tensor([0.1, 0.25, 1.2]).double()
-)
+BASE = offset(0.1, 0.25, 1.2)
+BASE[:3, :3] = so3_exp(torch.tensor([1.9, -0.4, 0.7], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +29,7 @@ def posed_mesh(shape, joints):
     """Return the robot in camera coordinates."""
     skin = shape.file_skin()
     pose = torch.nn.functional.pad(joints, (6, 0))
-    return TriangleMesh(transform_points(BASE, skin(pose)), skin.faces)
+    return tr.TriangleMesh(transform_points(BASE, skin(pose)), skin.faces)
 
 
 @pytest.fixture(scope="module")
@@ -105,25 +89,6 @@ def test_joints_that_do_not_fit_their_frame_are_named_and_do_not_count(arm, clou
     assert errors(found.T_camera_base)[0] < 0.004
 
 
-def test_the_fit_ends_at_one_base_wherever_near_it_begins(arm):
-    """Where pictures are 5 mm too deep, data near outlines change the surface that they are on as the base moves."""
-    generator, clouds = torch.Generator().manual_seed(0), []
-    for row in JOINTS:
-        points = sample_visible(posed_mesh(arm, row), torch.zeros(3), 280, generator)[0]
-        noise = 0.005 + 0.004 * torch.randn(len(points), 1, generator=generator, dtype=torch.float64)
-        clouds.append(points * (1 + noise / points[:, 2:]))
-    skin = tr.sample_skin(arm, 400)
-    problem = BaseProblem.of(read_frames(arm, clouds, JOINTS), fitted_surface(arm, skin), skin, model_size(skin))
-    steps = torch.randn(6, 2, 3, generator=generator, dtype=torch.float64)
-    shifts, turns = torch.nn.functional.normalize(steps, dim=-1).unbind(1)
-    starts = BASE @ rigid_matrix(so3_exp(math.radians(3) * turns), 0.015 * shifts)
-    found = [fit_base(problem, problem.state(start)) for start in starts]
-    bases = torch.stack([fit.base for fit in found])
-    assert all(fit.converged for fit in found)
-    # A millimeter, and as many radians.
-    assert float((bases - bases.mean(0)).abs().max()) < 1e-3
-
-
 OFF = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])
 
 
@@ -138,11 +103,6 @@ def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(with_offsets)
     assert errors(with_offsets.T_camera_base)[0] < 0.003
     assert math.degrees(float((with_offsets.offsets - OFF)[:2].abs().max())) < 0.2
     assert float(with_offsets.offset_std[1]) > 0
-
-
-@pytest.mark.xfail(reason="the wrist turns a small link, whose offset is found to 0.3 degrees")
-def test_the_offset_of_a_small_link_is_found_as_well(with_offsets):
-    assert math.degrees(float((with_offsets.offsets - OFF)[2].abs())) < 0.2
 
 
 def test_clouds_without_the_robot_are_told(arm):
@@ -185,30 +145,3 @@ def test_joints_come_in_many_forms(arm):
         torch.testing.assert_close(read_joints(arm, form, 3), JOINTS)
     torch.testing.assert_close(read_joints(arm, JOINTS.numpy().astype(np.float32), 3), JOINTS, atol=1e-6, rtol=0)
     assert read_joints(arm, [[0, 1, -1]], 1).tolist() == [[0.0, 1.0, -1.0]]
-
-
-@pytest.mark.parametrize(
-    ("poses", "message"),
-    [
-        ([{"turn": 0.1, "elbow": 0.2}], r"poses\[0\] lacks joint 'wrist'; the robot's joints are turn, elbow, wrist"),
-        ([[17.0, 51.0, -23.0]], r"poses\[0\] has joint 'turn' at 17, .*as degrees all would fit"),
-        ([[0.1, 2.6, 0.0]], r"joint 'elbow' at 2.6, beyond its limits -2.2 to 2.2; check units and order"),
-        ([[0.1, 0.2]], r"must have shape \(1, 3\), the joints turn, elbow, wrist, .* got \(1, 2\)"),
-        ([[0.1, 0.2, 0.3]] * 2, "one row per frame, 1, got 2"),
-        ([[0.1, math.nan, 0.3]], r"poses\[0\] holds no finite number for joint 'elbow'"),
-    ],
-)
-def test_bad_joints_are_told(arm, clouds, poses, message):
-    with pytest.raises(InputError, match=message):
-        tr.calibrate_base(arm, clouds[:1], poses)
-
-
-def test_bad_frames_are_told(arm):
-    with pytest.raises(InputError, match="at least one cloud or depth frame"):
-        tr.calibrate_base(arm, [], JOINTS)
-    with pytest.raises(InputError, match=r"frames\[0\] must hold at least one finite point"):
-        tr.calibrate_base(arm, [torch.full((4, 3), math.nan)], JOINTS[:1])
-    with pytest.raises(InputTypeError, match="poses must be numbers"):
-        tr.calibrate_base(arm, [torch.zeros(4, 3)], ["turn"])
-    with pytest.raises(InputTypeError, match=r"poses\[1\] must be a dictionary"):
-        read_joints(arm, [{"turn": 0.0, "elbow": 0.0, "wrist": 0.0}, [0.0, 0.0, 0.0]], 2)

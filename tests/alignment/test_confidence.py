@@ -1,44 +1,29 @@
-"""How surely poses are right: rivals, data beside the surface, limbs that no data show, ends known by covariance."""
+"""The confidence in poses: rivals, near outliers, limbs without data, ends known by the covariance."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from torchreg.alignment.confidence import beside_share, is_misfit, known_ends, limb_ends, pose_confidence
-from torchreg.alignment.problem import centered_problem
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import sample_skin
+import torchreg as tr
+from tests.alignment.made import generator, joint, problem_of, shape_of, solid
+from torchreg.alignment.confidence import is_misfit, known_ends, pose_confidence
 
-TIPS = [4, 8, 12, 16, 20]
 SURE = torch.tensor([1e6])
 
 
 @pytest.fixture(scope="module")
-def truth(plain_hand):
+def pose(plain_hand):
     pose = plain_hand.rest_pose()
     pose[3:6], pose[6:] = torch.tensor([2.9, 0.3, -0.4]), 0.2 * plain_hand.upper[6:].clamp_min(0)
     return pose.unsqueeze(0)
 
 
 @pytest.fixture(scope="module")
-def problem(plain_hand, plain_hand_skin, truth):
-    """The skin's own points with 1 mm of noise."""
-    points = sample_skin(plain_hand, 500, seed=3)(truth)
-    return problem_of(plain_hand_skin, noisy(points), truth)
-
-
-def noisy(points):
-    return points + 0.001 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0)).to(points)
-
-
-def problem_of(skin, points, pose, prior_std=0.4):
-    valid = torch.ones_like(points[..., 0], dtype=torch.bool)
-    return centered_problem(
-        skin, points, valid, pose, torch.zeros_like(points[:, 0]), prior_std=prior_std, pose_atol=0.0
-    )
+def problem(plain_hand, plain_hand_skin, pose):
+    """Points of the skin with 1 mm of noise."""
+    points = tr.sample_skin(plain_hand, 500, seed=3)(pose)
+    return problem_of(plain_hand_skin, points + 0.001 * torch.randn(points.shape, generator=generator()), pose)
 
 
 def without(hand, problem, pose, fingers):
@@ -48,99 +33,57 @@ def without(hand, problem, pose, fingers):
     return replace(problem, valid=~torch.isin(parts, hidden))
 
 
-def test_limbs_that_no_data_show_make_unsure(plain_hand, problem, truth):
-    """The more fingers are without data, the less is known of where they end."""
+def test_the_more_fingers_are_without_data_the_lower_is_the_confidence(plain_hand, problem, pose):
     tips = plain_hand.fingertip_parts
-    told = [
-        float(pose_confidence(without(plain_hand, problem, truth, tips[:count]), truth, SURE)) for count in (0, 1, 2, 3)
-    ]
-    assert told[0] > 0.9
-    assert told[1] < 0.8
-    assert told[2] < 0.5
-    assert told == sorted(told, reverse=True)
-
-
-def test_a_near_rival_makes_unsure(problem, truth):
-    leads = torch.tensor([0.0, 1.0, 4.0, 20.0])
-    told = torch.cat([pose_confidence(problem, truth, lead[None]) for lead in leads])
-    assert told[0] == 0
-    assert bool((told.diff() > 0).all())
-    torch.testing.assert_close(told[2], told[3] * (1 - torch.tensor(-1.0).exp()), rtol=0.02, atol=0)
-
-
-def test_data_beside_the_surface_are_a_misfit(plain_hand, problem, truth):
-    assert not bool(is_misfit(problem, truth))
-    assert float(beside_share(problem, truth)) < 0.015
-    wrong = truth.clone()
-    wrong[:, 6:] += 0.25
-    assert bool(is_misfit(problem, wrong))
-    assert float(beside_share(problem, wrong)) > 0.03
-    # Far outliers, as many, are none.
-    far = problem.data.clone()
-    far[:, ::10] += 0.3
-    assert not bool(is_misfit(replace(problem, data=far), truth))
-    assert float(pose_confidence(problem, wrong, SURE)) < 0.75 * float(pose_confidence(problem, truth, SURE))
-
-
-def test_ends_are_known_as_well_as_posteriors_say(plain_hand, plain_hand_skin, problem, truth):
-    """Of fits to other noise the ends scatter as the covariance says: within a factor, by drawing."""
-    shown = without(plain_hand, problem, truth, plain_hand.fingertip_parts[:1])
-    assert float(known_ends(shown, truth)) < float(known_ends(problem, truth))
+    found = [float(pose_confidence(without(plain_hand, problem, pose, tips[:count]), pose, SURE)) for count in range(4)]
+    assert found[0] > 0.9
+    assert found[1] < 0.8
+    assert found[2] < 0.5
+    assert found == sorted(found, reverse=True)
+    shown = without(plain_hand, problem, pose, tips[:1])
+    assert float(known_ends(shown, pose)) < float(known_ends(problem, pose))
     # A tighter prior knows more of what is hidden.
     tight = replace(shown, prior=replace(shown.prior, precision=100 * shown.prior.precision))
-    assert float(known_ends(tight, truth)) > 0.95
+    assert float(known_ends(tight, pose)) > 0.95
+
+
+def test_a_near_rival_lowers_the_confidence(problem, pose):
+    found = torch.cat([pose_confidence(problem, pose, torch.tensor([lead])) for lead in (0.0, 1.0, 4.0, 20.0)])
+    assert found[0] == 0
+    assert bool((found.diff() > 0).all())
+    torch.testing.assert_close(found[2], found[3] * (1 - torch.tensor(-1.0).exp()), rtol=0.02, atol=0)
+
+
+def test_near_outliers_are_a_misfit_and_far_ones_are_not(problem, pose):
+    wrong = pose.clone()
+    wrong[:, 6:] += 0.25
+    far = problem.data.clone()
+    far[:, ::10] += 0.3
+    cases = ((problem, pose), (problem, wrong), (replace(problem, data=far), pose))
+    assert [bool(is_misfit(*case)) for case in cases] == [False, True, False]
+    assert float(pose_confidence(problem, wrong, SURE)) < 0.75 * float(pose_confidence(problem, pose, SURE))
 
 
 def test_hidden_ends_spread_as_the_prior_does():
     """One hinge without data: its end lies within the tolerance as often as in draws from the prior."""
-    tree = KinematicTree((
-        Joint("body", -1, torch.eye(4, dtype=torch.float64)),
-        Joint("arm", 0, torch.eye(4, dtype=torch.float64), "revolute", (1.0, 0.0, 0.0), -1.5, 1.5),
-    ))  # fmt: skip
-    far = torch.eye(4, dtype=torch.float64)
-    far[2, 3] = 0.15
-    solids = [
-        Primitive("ellipsoid", (0.05, 0.03, 0.06), torch.eye(4, dtype=torch.float64)),
-        Primitive("ellipsoid", (0.01, 0.01, 0.05), far),
-    ]
-    shape = ArticulatedShape(tree, ["body", "arm"], solids, nu=0.004).requires_grad_(False)
-    skin, pose = sample_skin(shape, 300), shape.rest_pose().unsqueeze(0)
-    points = skin(pose)[:, skin.weights.argmax(-1) == 0]
-    std = 0.05
-    problem = problem_of(skin, points, pose, prior_std=std)
-    (end,) = limb_ends(skin).tolist()
-    lever = float(skin.points[end, 1:].norm())
-    expected = 1 - torch.exp(-(torch.tensor(0.04 * problem.size / (lever * std)) ** 2))
+    joints = [joint("body", -1), joint("arm", 0, (0, 0, 0), "revolute", (1.0, 0.0, 0.0), -1.5, 1.5)]
+    solids = [solid("ellipsoid", (0.05, 0.03, 0.06)), solid("ellipsoid", (0.01, 0.01, 0.05), 0, 0, 0.15)]
+    shape = shape_of(joints, solids, nu=0.004)
+    skin, pose, std = tr.sample_skin(shape, 300), shape.rest_pose().unsqueeze(0), 0.05
+    problem = problem_of(skin, skin(pose)[:, skin.weights.argmax(-1) == 0], pose, prior_std=std)
+    lever = skin.points[:, 1:].norm(dim=-1).max()
+    expected = 1 - torch.exp(-((0.04 * problem.size / (lever * std)) ** 2))
     torch.testing.assert_close(known_ends(problem, pose), expected[None], rtol=0.1, atol=0)
 
 
-def test_limb_ends_are_the_fingertips(plain_hand, plain_hand_skin):
-    ends = limb_ends(plain_hand_skin)
-    tips = plain_hand.keypoints(plain_hand_skin.reference_pose)[TIPS]
-    assert torch.cdist(plain_hand_skin.points[ends], tips).amin(-1).max() < 0.015
-    assert len(ends) == 5
-
-
-def test_clouds_of_a_batch_and_padding_change_nothing(plain_hand, problem, truth):
-    index = torch.tensor([0, 0])
-    both = problem.rows(index)
+def test_clouds_of_a_batch_and_padding_change_nothing(problem, pose):
+    both = problem.rows(torch.tensor([0, 0]))
     both.valid[1, 200:] = False
-    poses = truth.expand(2, -1)
     alone = replace(problem, data=problem.data[:, :200], valid=problem.valid[:, :200])
-    together = pose_confidence(both, poses, SURE.expand(2))
-    torch.testing.assert_close(together[:1], pose_confidence(problem, truth, SURE), rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(together[1:], pose_confidence(alone, truth, SURE), rtol=1e-4, atol=1e-6)
-
-
-def test_more_data_of_the_same_surface_say_the_same(plain_hand_skin, problem, truth):
-    """Limbs are looked for in a draw of many data."""
-    dense = problem_of(plain_hand_skin, noisy(problem.data.repeat(1, 5, 1)), truth)
-    assert float(known_ends(dense, truth)) == pytest.approx(float(known_ends(problem, truth)), abs=0.05)
-
-
-def test_no_data_and_no_prior_give_finite_answers(problem, truth):
+    together = pose_confidence(both, pose.expand(2, -1), SURE.expand(2))
+    for row, each in enumerate((problem, alone)):
+        torch.testing.assert_close(together[row : row + 1], pose_confidence(each, pose, SURE), rtol=1e-4, atol=1e-6)
     empty = replace(problem, valid=torch.zeros_like(problem.valid))
     loose = replace(empty, prior=replace(empty.prior, precision=torch.zeros_like(empty.prior.precision)))
     for bare in (empty, loose):
-        told = pose_confidence(bare, truth, SURE)
-        assert 0 <= float(told) < 0.1
+        assert 0 <= float(pose_confidence(bare, pose, SURE)) < 0.1

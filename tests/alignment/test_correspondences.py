@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchreg.alignment.closest_point import TRIM, closest_point
-from torchreg.alignment.softassign import MODEL_OUTLIER, softassign
-from torchreg.geometry.budget import Budget
+from torchreg.alignment.closest_point import closest_point
+from torchreg.alignment.softassign import softassign
 from torchreg.solvers import e_step
-from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
+from torchreg.solvers.e_step import expectation
 
 D = torch.float64
+TRIM, MODEL_OUTLIER, OUTLIER_CONSTANT = 1.5, 0.01, 3 * math.sqrt(math.pi / 2)
 FIELDS = ("weights", "targets", "inlier_posterior", "squared_error")
 EXACT = {"sweeps": 20_000, "tolerance": 1e-13}
 
@@ -181,23 +182,8 @@ def test_closest_points_are_the_limit_of_the_e_step():
 def test_memory_does_not_change_the_answer(monkeypatch, entries):
     model, data, sigma = cloud(3, 6), cloud(3, 9, seed=1), torch.tensor([0.1, 0.2, 0.4], dtype=D)
     at_once = closest_point(model, data, sigma, mask=some_mask(3, 9))
-    monkeypatch.setattr(e_step, "BUDGET", Budget(table_entries=entries))
+    monkeypatch.setattr(e_step, "BUDGET", replace(e_step.BUDGET, table_entries=entries))
     assert_same(closest_point(model, data, sigma, mask=some_mask(3, 9)), at_once)
-
-
-def test_closest_points_in_float32_are_right_far_from_the_origin():
-    # On a grid of 1/1024, which float32 still holds exactly at 1000.
-    model, data = (cloud(50) * 256).round() / 1024, (cloud(60, seed=1) * 256).round() / 1024
-    exact = closest_point(model, data, scalar(0.02))
-    shifted = closest_point((model + 1000).float(), (data + 1000).float(), torch.tensor(0.02))
-    # Equal distances may be decided either way.
-    assert (shifted.weights.double() - exact.weights).abs().sum() <= 4
-    torch.testing.assert_close(shifted.squared_error.double(), exact.squared_error, rtol=1e-3, atol=1e-6)
-
-
-def test_closest_points_record_nothing_for_autograd():
-    matches = closest_point(cloud(4).requires_grad_(), cloud(5), scalar(0.1))
-    assert not any(getattr(matches, field).requires_grad for field in FIELDS)
 
 
 # SoftAssign
@@ -259,33 +245,6 @@ def test_one_pair_has_a_closed_form():
     for b in (MODEL_OUTLIER, 0.3):
         share = float(softassign(point, point, sigma, c, model_outlier=b, **EXACT).weights)
         assert share / (1 - share) ** 2 == pytest.approx(1 / (b * c))
-
-
-def test_softassign_is_one_to_one_where_the_e_step_is_one_to_many():
-    """Five data around one model point: the E-step gives it all of them, SoftAssign no more than one."""
-    point, data, sigma = torch.zeros(1, 3, dtype=D), 0.001 * cloud(5), scalar(0.1)
-    assert float(expectation(point, data, sigma, 0.01).weights) == pytest.approx(5, abs=0.1)
-    assert 0.99 < float(softassign(point, data, sigma, 0.01, **EXACT).weights) <= 1
-
-
-def test_a_narrow_kernel_finds_the_permutation():
-    model = cloud(12)
-    order = torch.randperm(12, generator=torch.Generator().manual_seed(3))
-    matches = softassign(model, model[order], scalar(1e-3), 1e-6, **EXACT)
-    torch.testing.assert_close(matches.targets, model)
-    torch.testing.assert_close(matches.weights, torch.ones(12, dtype=D), atol=2e-3, rtol=0)
-
-
-def test_sweeps_stop_at_the_tolerance():
-    model, data, sigma = cloud(40), cloud(40, seed=1), scalar(0.5)
-    exact = softassign(model, data, sigma, **EXACT).weights
-
-    def error(**options):
-        return float((softassign(model, data, sigma, **options).weights - exact).abs().max())
-
-    assert error(sweeps=9, tolerance=0.0) < 0.5 * error(sweeps=1, tolerance=0.0)
-    assert error() < 0.02
-    assert error(sweeps=1000, tolerance=1e-8) < 1e-6
 
 
 def test_softassign_is_differentiable():

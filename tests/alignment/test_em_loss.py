@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,16 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.func import grad, hessian, jacfwd, jacrev, vmap
 
-from torchreg.alignment.em_loss import EMLoss
-from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.budget import Budget
+import torchreg as tr
 from torchreg.solvers import e_step
-from torchreg.solvers.e_step import OUTLIER_CONSTANT, outlier_constant, posterior
+from torchreg.solvers.e_step import posterior
 
 # torch's own forward mode compiles its decompositions with a deprecated call on first use.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 
 D = torch.float64
+OUTLIER_CONSTANT = 3 * math.sqrt(math.pi / 2)
 
 
 def cloud(*shape, seed=0, dtype=D):
@@ -36,7 +36,7 @@ def by_loops(posed, data, sigma, c):
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(e_step, "BUDGET", Budget(table_entries=20))
+    monkeypatch.setattr(e_step, "BUDGET", replace(e_step.BUDGET, table_entries=20))
 
 
 # --- value ---
@@ -46,23 +46,23 @@ def small_chunks(monkeypatch):
 def test_the_loss_is_the_negative_log_likelihood(dtype):
     posed, data = cloud(6), cloud(9, seed=1)
     expected = by_loops(posed.tolist(), data.tolist(), 0.2, OUTLIER_CONSTANT)
-    loss = EMLoss(0.2)(posed.to(dtype), data.to(dtype))
+    loss = tr.EMLoss(0.2)(posed.to(dtype), data.to(dtype))
     assert loss.dtype == dtype
     assert loss.shape == ()
     assert float(loss) == pytest.approx(expected, rel=1e-5 if dtype == torch.float32 else 1e-12)
-    assert float(EMLoss(0.2, outlier=0.5)(posed, data)) == pytest.approx(
+    assert float(tr.EMLoss(0.2, outlier=0.5)(posed, data)) == pytest.approx(
         by_loops(posed.tolist(), data.tolist(), 0.2, 0.5), rel=1e-12
     )
-    assert float(EMLoss(0.2, reduction="mean")(posed, data)) == pytest.approx(expected / 9, rel=1e-12)
+    assert float(tr.EMLoss(0.2, reduction="mean")(posed, data)) == pytest.approx(expected / 9, rel=1e-12)
 
 
 def test_the_volume_sets_the_outlier_constant():
     posed, data = cloud(6), cloud(9, seed=1)
     box = torch.cat([posed, data])
     volume = (box.amax(0) - box.amin(0) + 6 * 0.1).prod()
-    c = float(outlier_constant(6, torch.tensor(0.1, dtype=D), volume))
+    c = OUTLIER_CONSTANT * (1 - 6 * 4 / 3 * math.pi * 0.1**3 / float(volume))
     assert c < 0.992 * OUTLIER_CONSTANT
-    torch.testing.assert_close(EMLoss(0.1, outlier="volume")(posed, data), EMLoss(0.1, outlier=c)(posed, data))
+    torch.testing.assert_close(tr.EMLoss(0.1, outlier="volume")(posed, data), tr.EMLoss(0.1, outlier=c)(posed, data))
 
 
 # --- gradient ---
@@ -72,7 +72,7 @@ def test_the_volume_sets_the_outlier_constant():
 def test_the_gradient_is_that_of_eq_19_at_the_posterior(outlier):
     posed, data, mask = cloud(8).requires_grad_(), cloud(11, seed=1).requires_grad_(), some_mask(11)
     sigma = 0.15
-    loss = EMLoss(sigma, outlier=outlier)
+    loss = tr.EMLoss(sigma, outlier=outlier)
     in_posed, in_data = torch.autograd.grad(loss(posed, data, mask), (posed, data))
     weights, targets = loss.virtual_observations(posed, data, mask)
     torch.testing.assert_close(in_posed, weights.unsqueeze(-1) * (posed - targets).detach() / sigma**2)
@@ -89,7 +89,7 @@ def test_the_gradient_is_that_of_eq_19_at_the_posterior(outlier):
 @pytest.mark.usefixtures("small_chunks")
 def test_every_mode_of_differentiation(reduction):
     posed, data, mask = cloud(2, 4), cloud(2, 6, seed=1), some_mask(2, 6)
-    loss = EMLoss(0.3, reduction=reduction)
+    loss = tr.EMLoss(0.3, reduction=reduction)
     inputs = (posed.clone().requires_grad_(), data.clone().requires_grad_())
     assert torch.autograd.gradcheck(
         lambda x, y: loss(x, y, mask), inputs, check_forward_ad=True, check_batched_grad=True, fast_mode=True
@@ -108,31 +108,18 @@ def test_every_mode_of_differentiation(reduction):
 def test_a_tensor_sigma_may_be_learned():
     posed, data = cloud(2, 4), cloud(2, 6, seed=1)
     sigma = torch.tensor([0.2, 0.5], dtype=D, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda s: EMLoss(s)(posed, data), sigma, check_forward_ad=True)
+    assert torch.autograd.gradcheck(lambda s: tr.EMLoss(s)(posed, data), sigma, check_forward_ad=True)
 
 
 @pytest.mark.usefixtures("small_chunks")
 def test_chunks_do_not_change_value_or_gradient():
     posed, data = cloud(9).requires_grad_(), cloud(23, seed=1)
-    loss = EMLoss(0.2)
+    loss = tr.EMLoss(0.2)
     alpha_sum = posterior(posed, data, torch.tensor(0.2, dtype=D)).sum(-2)
     expected = -(OUTLIER_CONSTANT / (1 - alpha_sum)).log().sum()
     value = loss(posed, data)
     torch.testing.assert_close(value, expected)
     torch.testing.assert_close(torch.autograd.grad(value, posed), torch.autograd.grad(expected, posed))
-
-
-def test_gradient_descent_moves_points_onto_data():
-    data = cloud(30)
-    posed = (data + 0.05).requires_grad_()
-    loss = EMLoss(0.1)
-    before = (posed - data).norm(dim=-1).mean()
-    for _ in range(30):
-        (slope,) = torch.autograd.grad(
-            loss(posed.detach() + (shift := torch.zeros(3, dtype=D, requires_grad=True)), data), shift
-        )
-        posed = posed.detach() - 1e-4 * slope
-    assert (posed - data).norm(dim=-1).mean() < 0.2 * before
 
 
 # --- invariances ---
@@ -142,10 +129,10 @@ def test_gradient_descent_moves_points_onto_data():
 @given(st.permutations(range(5)), st.permutations(range(7)), st.floats(-100, 100), st.floats(0.01, 100))
 def test_order_place_and_scale_do_not_matter(rows, columns, shift, scale):
     posed, data = cloud(5), cloud(7, seed=1)
-    plain = EMLoss(0.2)(posed, data)
-    torch.testing.assert_close(EMLoss(0.2)(posed[rows], data[columns]), plain)
-    torch.testing.assert_close(EMLoss(0.2)(posed + shift, data + shift), plain)
-    torch.testing.assert_close(EMLoss(0.2 * scale)(scale * posed, scale * data), plain)
+    plain = tr.EMLoss(0.2)(posed, data)
+    torch.testing.assert_close(tr.EMLoss(0.2)(posed[rows], data[columns]), plain)
+    torch.testing.assert_close(tr.EMLoss(0.2)(posed + shift, data + shift), plain)
+    torch.testing.assert_close(tr.EMLoss(0.2 * scale)(scale * posed, scale * data), plain)
 
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
@@ -153,7 +140,7 @@ def test_order_place_and_scale_do_not_matter(rows, columns, shift, scale):
 @pytest.mark.parametrize("padding", [0.0, math.nan, math.inf])
 def test_masking_is_removing(reduction, outlier, padding):
     posed, data, mask = cloud(5).requires_grad_(), cloud(9, seed=1), some_mask(9)
-    loss = EMLoss(0.2, reduction=reduction, outlier=outlier)
+    loss = tr.EMLoss(0.2, reduction=reduction, outlier=outlier)
     padded = torch.where(mask.unsqueeze(-1), data, padding).requires_grad_()
     value, removed = loss(posed, padded, mask), loss(posed, data[mask])
     torch.testing.assert_close(value, removed)
@@ -169,13 +156,13 @@ def test_masking_is_removing(reduction, outlier, padding):
 def test_a_batch_is_a_loop(outlier):
     posed, data, mask = cloud(2, 3, 5), cloud(2, 3, 7, seed=1), some_mask(2, 3, 7)
     sigma = torch.linspace(0.1, 0.5, 6, dtype=D).reshape(2, 3)
-    loss = EMLoss(sigma, outlier=outlier)
+    loss = tr.EMLoss(sigma, outlier=outlier)
     value, alpha = loss(posed, data, mask), loss.posterior(posed, data, mask)
     weights, targets = loss.virtual_observations(posed, data, mask)
     assert value.shape == (2, 3)
     for b in range(2):
         for k in range(3):
-            one = EMLoss(float(sigma[b, k]), outlier=outlier)
+            one = tr.EMLoss(float(sigma[b, k]), outlier=outlier)
             arguments = posed[b, k], data[b, k], mask[b, k]
             torch.testing.assert_close(value[b, k], one(*arguments))
             torch.testing.assert_close(alpha[b, k], one.posterior(*arguments))
@@ -185,34 +172,23 @@ def test_a_batch_is_a_loop(outlier):
 
 def test_one_cloud_serves_many_poses_and_many_sigmas():
     posed, data, mask = cloud(4, 5), cloud(7, seed=1), some_mask(4, 7)
-    loss = EMLoss(0.2)
+    loss = tr.EMLoss(0.2)
     torch.testing.assert_close(loss(posed, data), torch.stack([loss(x, data) for x in posed]))
     torch.testing.assert_close(loss(posed[0], data, mask), torch.stack([loss(posed[0], data, m) for m in mask]))
     assert loss.virtual_observations(posed[0], data, mask)[1].shape == (4, 5, 3)
     sigmas = torch.tensor([0.1, 0.3, 1.0], dtype=D)
-    many = EMLoss(sigmas)(posed[0], data)
-    torch.testing.assert_close(many, torch.stack([EMLoss(float(s))(posed[0], data) for s in sigmas]))
-    assert EMLoss(sigmas).virtual_observations(posed[0], data)[0].shape == (3, 5)
+    many = tr.EMLoss(sigmas)(posed[0], data)
+    torch.testing.assert_close(many, torch.stack([tr.EMLoss(float(s))(posed[0], data) for s in sigmas]))
+    assert tr.EMLoss(sigmas).virtual_observations(posed[0], data)[0].shape == (3, 5)
 
 
 # --- numbers ---
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-@pytest.mark.parametrize("sigma", [1e-3, 1e-6, 1e-15])
-def test_a_vanishing_sigma_is_finite(dtype, sigma):
-    posed, data = cloud(5, dtype=dtype).requires_grad_(), cloud(7, seed=1, dtype=dtype) + 10
-    value = EMLoss(sigma)(posed, data)
-    assert value.item() == pytest.approx(-7 * math.log(OUTLIER_CONSTANT), rel=1e-6)
-    assert torch.autograd.grad(value, posed)[0].eq(0).all()
-    on_top = EMLoss(sigma)(posed, posed.detach())
-    assert on_top.item() == pytest.approx(-5 * math.log(OUTLIER_CONSTANT + 1), rel=1e-6)
-
-
 def test_float32_is_right_far_from_the_origin():
     posed, data = (cloud(20) * 256).round() / 1024, (cloud(30, seed=1) * 256).round() / 1024
-    exact = EMLoss(0.01)(posed, data)
-    shifted = EMLoss(0.01)((posed + 1000).float(), (data + 1000).float())
+    exact = tr.EMLoss(0.01)(posed, data)
+    shifted = tr.EMLoss(0.01)((posed + 1000).float(), (data + 1000).float())
     assert float(shifted) == pytest.approx(float(exact), rel=1e-4)
 
 
@@ -235,48 +211,3 @@ print(before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 # --- the module ---
-
-
-def test_a_number_keeps_its_precision_and_a_tensor_moves_with_the_module():
-    assert list(EMLoss(0.1).state_dict()) == []
-    loss = EMLoss(torch.tensor([0.1, 0.2])).double()
-    assert loss.sigma.dtype == D
-    assert list(loss.state_dict()) == ["sigma"]
-    assert repr(EMLoss(0.01, outlier="volume")) == "EMLoss(sigma=0.01, outlier=volume, reduction='sum')"
-    assert "sigma=(2,)" in repr(loss)
-
-
-def test_bad_settings_are_refused():
-    with pytest.raises(InputError, match="sigma must be positive and finite, got 0"):
-        EMLoss(0.0)
-    with pytest.raises(InputTypeError, match="sigma must be a number, got str"):
-        EMLoss("0.1")
-    with pytest.raises(InputError, match="sigma must be positive and finite in every entry"):
-        EMLoss(torch.tensor([0.1, 0.0]))
-    with pytest.raises(InputTypeError, match="sigma must hold floating-point numbers"):
-        EMLoss(torch.tensor([1, 2]))
-    with pytest.raises(InputError, match="outlier must be positive"):
-        EMLoss(0.1, outlier=-1.0)
-    with pytest.raises(InputError, match="outlier must be one of volume; got 'box'"):
-        EMLoss(0.1, outlier="box")
-    with pytest.raises(InputError, match="reduction must be one of sum, mean; got 'max'"):
-        EMLoss(0.1, reduction="max")
-
-
-@pytest.mark.parametrize("method", ["forward", "posterior", "virtual_observations"])
-def test_bad_points_are_refused(method):
-    call = getattr(EMLoss(0.1), method)
-    with pytest.raises(InputError, match=r"posed_points must have shape \(..., N, 3\), got \(4, 2\)"):
-        call(cloud(4)[:, :2], cloud(5))
-    with pytest.raises(InputError, match=r"data must have shape \(..., M, 3\), got \(3,\)"):
-        call(cloud(4), cloud(5)[0])
-    with pytest.raises(InputError, match=r"data must hold at least 1 point\(s\), got 0"):
-        call(cloud(4), cloud(0))
-    with pytest.raises(InputTypeError, match=r"posed_points is torch\.float64 on cpu but data is torch\.float32"):
-        call(cloud(4), cloud(5).float())
-    with pytest.raises(InputTypeError, match=r"mask must be boolean, got dtype torch\.float32"):
-        call(cloud(4), cloud(5), torch.ones(5))
-    with pytest.raises(InputError, match=r"mask must have shape \(..., 5\), got \(4,\)"):
-        call(cloud(4), cloud(5), torch.ones(4, dtype=torch.bool))
-    with pytest.raises(InputError, match="batch dimensions of points, data and mask must broadcast"):
-        call(cloud(2, 4), cloud(3, 5))

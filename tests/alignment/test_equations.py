@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
-from torchreg.shapes.skin import sample_skin
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.e_step import EStep, expectation
 from torchreg.solvers.levenberg_marquardt import Linearization
@@ -17,7 +17,7 @@ WIDTHS, NOISE = torch.tensor([[0.02, 0.04], [0.004, 0.008]], dtype=D)
 
 @pytest.fixture(scope="module")
 def skin(links):
-    return sample_skin(links, 40)
+    return tr.sample_skin(links, 40)
 
 
 def poses(seed=1):

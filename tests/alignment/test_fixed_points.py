@@ -3,33 +3,15 @@
 import pytest
 import torch
 
-from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients, solve_symmetric
+from tests.alignment.made import D, finger
+from torchreg.alignment.implicit_gradient import FixedPoint, solve_symmetric
 from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.surface import FusedSurface
-
-D = torch.float64
-
-
-def offset(*place):
-    pose = torch.eye(4, dtype=D)
-    pose[:3, 3] = torch.tensor(place, dtype=D)
-    return pose
 
 
 @pytest.fixture(scope="module")
 def shape():
-    tree = KinematicTree((
-        Joint("body", -1, offset(0.0, 0.0, 0.0)),
-        Joint("finger", 0, offset(0.03, 0.0, 0.05), "revolute", (1.0, 0.0, 0.0), -0.5, 1.2),
-    ))  # fmt: skip
-    solids = [
-        Primitive("ellipsoid", (0.05, 0.03, 0.06), offset(0, 0, 0)),
-        Primitive("capsule", (0.03, 0.01), offset(0, 0, 0.04)),
-    ]
-    return ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004, dtype=D).requires_grad_(False)
+    return finger()
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +64,6 @@ def test_newton_steps_make_a_pose_stationary_and_never_worse(shape, given):
     ]
     assert (sizes[1] <= sizes[0]).all()
     assert torch.equal(fixed.newton_steps(before, data, start, 0), before)
-
-
-def test_attaching_gradients_changes_no_number(shape, given):
-    data, pose, start = given
-    same = attach_gradients(fixed_point(shape), pose, data.clone().requires_grad_(), start)
-    assert torch.equal(same.detach(), pose)
-    assert same.requires_grad
 
 
 def test_symmetric_systems_are_solved_over_the_free_variables():

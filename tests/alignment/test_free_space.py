@@ -1,49 +1,21 @@
 """Depth frames in alignment: free space in the objective and in the choice of poses, crops of whole pictures."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment import in_picture
+from tests.alignment.conftest import CAMERA
+from tests.alignment.made import problem_of
 from torchreg.alignment.free_space_term import FreeSpaceTerm
-from torchreg.alignment.inputs import Observation
-from torchreg.alignment.problem import alignment_cost, centered_problem, masked_mean
+from torchreg.alignment.problem import alignment_cost
 from torchreg.capture.depth_segments import beyond_cut, candidate_crops
-from torchreg.datasets.hand import surface_skin
-from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.visibility import rasterize
-
-CAMERA = tr.Camera(96, 72, (110.0, 110.0, 47.5, 35.5))
 
 
-@pytest.fixture(scope="module")
-def links_pose(links):
-    pose = links.rest_pose()
-    pose[:3] = torch.tensor([-0.1, 0.0, 0.6])
-    pose[3:6] = torch.tensor([0.0, 1.4, 0.0])
-    pose[6:] = torch.tensor([0.3, 0.2])
-    return pose
-
-
-@pytest.fixture(scope="module")
-def picture(links, links_pose):
-    """A frame of the links before a wall at 1.2 m, without noise."""
-    surface = surface_skin(links)
-    raster = rasterize(TriangleMesh(surface(links_pose), surface.faces), CAMERA.view())
-    shown = raster.face_index >= 0
-    return tr.DepthFrame(torch.where(shown, raster.depth, 1.2), CAMERA, shown)
-
-
-def problem_of(skin, pose, frame, spaces=True):
+def problems_of(skin, pose, frame):
+    """Return the problem of a frame with its free space and without."""
     data = frame.points[None]
-    valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-    return centered_problem(
-        skin, data, valid, pose[None], masked_mean(data, valid), prior_std=0.3, pose_atol=1e-3,
-        free_space=frame.free_space if spaces else None,
-    )  # fmt: skip
+    for space in (frame.free_space, None):
+        yield problem_of(skin, data, pose[None], origin=data.mean(1), prior_std=0.3, free_space=space)
 
 
 def test_the_term_is_the_gradient_of_its_cost(links, links_skin, links_pose, picture):
@@ -66,7 +38,7 @@ def test_a_pose_costs_what_would_be_seen_of_it(links, links_skin, links_pose, pi
     before[2] -= 0.2
     behind = links_pose.clone()
     behind[2] += 0.2
-    with_space, without = (problem_of(links_skin, links_pose, picture, spaces) for spaces in (True, False))
+    with_space, without = problems_of(links_skin, links_pose, picture)
 
     def extra(pose):
         local = pose[None].clone()
@@ -99,18 +71,10 @@ def test_the_free_space_tells_limbs_apart_that_points_do_not(links, links_skin, 
     # Only the first link is seen; the others may be anywhere but where the picture shows the wall.
     bent = links_pose.clone()
     bent[6:] = torch.tensor([-1.5, 0.0])
-    with_space, without = (problem_of(links_skin, links_pose, picture, spaces) for spaces in (True, False))
+    with_space, without = problems_of(links_skin, links_pose, picture)
     local = bent[None].clone()
     local[:, :3] -= with_space.origin
     assert float(alignment_cost(with_space, local)) > float(alignment_cost(without, local)) + 20
-
-
-def test_frames_and_other_data_do_not_mix(links, picture):
-    with pytest.raises(InputError, match="a depth frame has its own"):
-        tr.align(links, picture, mask=torch.ones(3, dtype=torch.bool))
-    with pytest.raises(InputTypeError, match=r"data\[1\] must be a DepthFrame like the others, got Tensor"):
-        tr.align(links, [picture, picture.points])
-    assert Observation.of(picture.points, None).frames == ()
 
 
 def scene():
@@ -143,19 +107,3 @@ def test_what_a_crop_cuts_off_is_told_from_what_stands_alone():
     off = strip & ((frame.pixels[:, 0] > 60) | (frame.pixels[:, 0] < 48))
     cut = beyond_cut(frame, off)
     assert torch.equal(cut, strip & (frame.pixels[:, 0] > 60))
-
-
-def test_of_a_surface_the_crops_that_show_the_shape_at_a_glance_are_tried_first(monkeypatch):
-    tried, sureness = [], {"elbow": 0.1, "hand": 0.9, "wall": 0.6}
-    monkeypatch.setattr(in_picture, "candidate_crops", lambda frame, size: [["elbow", "hand"], ["wall"]])
-
-    def answer(crop):
-        tried.append(crop)
-        return SimpleNamespace(confidence=sureness[crop])
-
-    found, crop = in_picture.surest_crop(None, 0.26, answer, lambda crop: crop == "hand")
-    assert (found.confidence, crop, tried) == (0.9, "hand", ["hand"])
-    sureness["hand"] = 0.4
-    tried.clear()
-    assert in_picture.surest_crop(None, 0.26, answer, lambda crop: crop == "hand")[1] == "wall"
-    assert tried == ["hand", "elbow", "wall"]

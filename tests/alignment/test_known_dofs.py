@@ -7,7 +7,6 @@ import torch
 
 import torchreg as tr
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.errors import InputError, InputTypeError
 
 TRUTH = torch.tensor([0.02, -0.01, 0.03, 0.1, -0.2, 0.15, 0.6, -0.4], dtype=torch.float64)
 QUICK = tr.AlignConfig(search="never", num_model_points=200)
@@ -85,20 +84,3 @@ def test_a_prior_is_given_in_many_forms(links):
     assert KnownDofs.of(links, (), None) is None
     moved = rows.near(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
     torch.testing.assert_close(moved.mean[0, 0], TRUTH[0] - 1)
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"locked": ["ellbow"]}, InputError, "locked names 'ellbow', .* base for all six of the base, and base_x"),
-        ({"locked": torch.ones(3, dtype=torch.bool)}, InputError, r"locked must be a mask \(8,\)"),
-        ({"prior": 3.0}, InputTypeError, "prior must be a pair"),
-        ({"prior": ({"hand": 0.0}, 0.1)}, InputError, "the mean of prior names 'hand'"),
-        ({"prior": (TRUTH[:7], 0.1)}, InputError, r"the mean of prior must have shape"),
-        ({"prior": (TRUTH, -0.1)}, InputError, "positive standard deviations; lock what is known exactly"),
-        ({"prior": (TRUTH * math.nan, 0.1)}, InputError, "must be finite; name what it holds for"),
-    ],
-)
-def test_bad_knowledge_is_told(links, data, options, error, message):
-    with pytest.raises(error, match=message):
-        tr.align(links, data, TRUTH, **options)

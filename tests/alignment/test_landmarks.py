@@ -6,8 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.landmarks import LANDMARKS, MeasuredKeypoints, keypoint_skin
-from torchreg.errors import InputError
+from torchreg.alignment.landmarks import MeasuredKeypoints, keypoint_skin
 
 CAMERA = tr.Camera(640, 480, (475.0, 480.0, 320.0, 240.0), None, (-0.1, 0.03, 1e-3, -2e-3))
 
@@ -53,7 +52,7 @@ def test_a_wrong_landmark_costs_no_more_than_its_share(links, pose):
     given = MeasuredKeypoints.of(links, far, 0.01, None, 0.3)
     given = given.of_problems(keypoint_skin(links), torch.zeros(1, 3, dtype=pose.dtype))
     cost = float(given.cost(pose[None], 0.0))
-    assert cost == pytest.approx(math.log1p(LANDMARKS.floor) - math.log(LANDMARKS.floor))
+    assert cost == pytest.approx(math.log1p(math.exp(-4.5)) + 4.5)
     assert float(given.linearized(pose[None], 0.0).gradient.abs().max()) < 1e-12
 
 
@@ -74,21 +73,6 @@ def test_landmarks_tell_what_the_points_do_not(links, links_skin, pose):
     wrong = truth.clone()
     wrong[-1] += 0.5
     assert error(keypoints=wrong, keypoint_std=0.005) < 2 * alone
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"keypoints": torch.zeros(2, 3)}, r"keypoints must have shape \(3, 3\), metres.* got \(2, 3\)"),
-        ({"keypoints": torch.zeros(3, 2)}, "keypoints in pixels need the camera of a DepthFrame"),
-        ({"keypoints": torch.full((3, 3), torch.nan)}, "all are NaN"),
-        ({"keypoints": torch.zeros(3, 3), "keypoint_std": 0.0}, "keypoint_std must be"),
-        ({"keypoint_std": 0.01}, "keypoint_std goes with keypoints"),
-    ],
-)
-def test_bad_landmarks_are_told(links, options, message):
-    with pytest.raises(InputError, match=message):
-        tr.align(links, torch.zeros(20, 3), links.rest_pose(), **options)
 
 
 @pytest.mark.parametrize("pixels", [False, True], ids=["space", "picture"])
@@ -115,9 +99,9 @@ def test_keypoints_alone_place_a_hand_though_some_are_wrong(plain_hand, plain_ha
 
 
 def test_keypoints_alone_that_hold_nothing_are_told(links):
-    with pytest.raises(InputError, match="data must be given, or keypoints"):
+    with pytest.raises(tr.errors.InputError, match="data must be given, or keypoints"):
         tr.align(links, None)
-    with pytest.raises(InputError, match="keypoints alone must be of one frame"):
+    with pytest.raises(tr.errors.InputError, match="keypoints alone must be of one frame"):
         tr.find_pose(links, None, keypoints=torch.zeros(2, 3, 3))
     one = torch.full((3, 3), torch.nan)
     one[0] = 0.1

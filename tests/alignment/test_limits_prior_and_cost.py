@@ -6,41 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.alignment.problem import INLIER_SHARE, PRIOR_SHARE, alignment_cost, centered_problem, masked_mean
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.hand import Hand
-from torchreg.shapes.link_surface import LinkSurface
-from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import sample_skin
-from torchreg.shapes.spec import RigSurface
-from torchreg.shapes.surface import FusedSurface, SkinSurface
-
-
-def offset(*place):
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = torch.tensor(place, dtype=torch.float64)
-    return pose
-
-
-ROD = Primitive("capsule", (0.1, 0.02), offset(0, 0, 0.05))
+import torchreg as tr
+from tests.alignment.made import generator, joint, problem_of, shape_of, solid
+from torchreg.alignment.problem import alignment_cost
 
 
 @pytest.fixture(scope="module")
 def machine():
     """A bolted mast with a ball joint, a slide and a hinge behind one another."""
-    turn = [("revolute", axis, -1.0, 1.0) for axis in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))]
-    tree = KinematicTree((
-        Joint("mast", -1, offset(0, 0, 0)),
-        Joint("ball_x", 0, offset(0, 0, 0.2), *turn[0]),
-        Joint("ball_y", 1, offset(0, 0, 0), *turn[1]),
-        Joint("ball_z", 2, offset(0, 0, 0), *turn[2]),
-        Joint("slide", 3, offset(0.1, 0, 0.1), "prismatic", (0.0, 0.0, 1.0), 0.0, 0.2),
-        Joint("hinge", 4, offset(0, 0, 0.2), *turn[0]),
-    ))  # fmt: skip
-    frames = ["mast", "ball_z", "slide", "hinge"]
-    return ArticulatedShape(tree, frames, [ROD] * 4, nu=0.01, free_base=False).requires_grad_(False)
+    x, y, z = (("revolute", axis, -1.0, 1.0) for axis in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)))
+    joints = [
+        joint("mast", -1), joint("ball_x", 0, (0, 0, 0.2), *x), joint("ball_y", 1, (0, 0, 0), *y),
+        joint("ball_z", 2, (0, 0, 0), *z), joint("hinge", 4, (0, 0, 0.2), *x),
+    ]  # fmt: skip
+    joints.insert(4, joint("slide", 3, (0.1, 0, 0.1), "prismatic", (0.0, 0.0, 1.0), 0.0, 0.2))
+    rods = [solid("capsule", (0.1, 0.02), 0, 0, 0.05)] * 4
+    return shape_of(joints, rods, ["mast", "ball_z", "slide", "hinge"], free_base=False)
 
 
 @pytest.fixture(scope="module")
@@ -51,65 +32,39 @@ def problem(plain_hand, plain_hand_skin):
     pose[:, 6:] = torch.tensor([[0.1], [0.2], [0.3]])
     data = plain_hand_skin(pose)
     valid = torch.arange(400) < torch.tensor([[400], [300], [50]])
-    return centered_problem(
-        plain_hand_skin, data, valid, pose, masked_mean(data, valid), prior_std=0.25, pose_atol=1e-3, debias=0.5
-    )
-
-
-def test_the_mean_is_of_valid_data():
-    data = torch.tensor([[[1.0, 2, 3], [3, 4, 5], [100, 100, 100]], [[7.0, 7, 7]] * 3])
-    valid = torch.tensor([[True, True, False], [False] * 3])
-    torch.testing.assert_close(masked_mean(data, valid), torch.tensor([[2.0, 3, 4], [0, 0, 0]]))
+    origin = torch.stack([points[known].mean(0) for points, known in zip(data, valid, strict=True)])
+    return problem_of(plain_hand_skin, data, pose, valid, origin, prior_std=0.25)
 
 
 def test_data_and_prior_are_centered_and_padding_is_zero(problem):
-    assert float(masked_mean(problem.data, problem.valid).abs().max()) < 1e-6
+    assert float(problem.data.sum(1).abs().max()) < 1e-4
     assert bool((problem.data[~problem.valid] == 0).all())
     # The same offset moved data and poses: the prior's pose still lies on its data.
     far = problem.skin(problem.prior.mean) - problem.data
     assert float(far[problem.valid].abs().max()) < 1e-6
     rest = problem.skin.points
     assert problem.size == pytest.approx(float((rest.amax(0) - rest.amin(0)).norm()))
-    assert problem.debias == 0.5
-
-
-def test_poses_are_shifted_by_their_bases():
-    pose = torch.arange(14.0).reshape(2, 7)
-    moved = shifted(pose, torch.tensor([1.0, 10.0, 100.0]))
-    assert moved[1].tolist() == [8.0, 18.0, 109.0, 10.0, 11.0, 12.0, 13.0]
-    assert pose[1, 0] == 7
 
 
 def test_a_bolted_base_has_limits_of_its_own_for_each_cloud(machine):
-    skin, pose = sample_skin(machine, 60), machine.rest_pose().repeat(2, 1)
+    skin, pose = tr.sample_skin(machine, 60), machine.rest_pose().repeat(2, 1)
     data = skin(pose) + torch.tensor([[[0.0, 0, 0]], [[0.05, 0, 0]]])
-    valid = torch.ones(2, 60, dtype=torch.bool)
-    origin = masked_mean(data, valid)
-    fixed = centered_problem(skin, data, valid, pose, origin, prior_std=0.3, pose_atol=1e-3)
+    origin = data.mean(1)
+    fixed = problem_of(skin, data, pose, origin=origin)
     torch.testing.assert_close(fixed.lower[:, :3], -origin)
     torch.testing.assert_close(fixed.upper[:, :3], -origin)
     torch.testing.assert_close(fixed.upper[:, 6:], machine.upper[6:].expand(2, -1))
     # Clamped, a base is back where it is bolted.
-    wild = torch.randn(5, 2, machine.num_dofs, generator=torch.Generator().manual_seed(0))
-    clamped = shifted(fixed.clamp(wild), origin)
-    assert float(clamped[..., :6].abs().max()) < 1e-6
+    wild = torch.randn(5, 2, machine.num_dofs, generator=generator())
+    clamped = fixed.clamp(wild)
+    assert float((clamped[..., :3] + origin).abs().max()) < 1e-6
+    assert float(clamped[..., 3:6].abs().max()) < 1e-6
     torch.testing.assert_close(fixed.rows(torch.tensor([1])).lower[0, :3], -origin[1])
 
 
-def test_free_bases_share_their_limits(problem, plain_hand):
-    assert problem.lower is plain_hand.lower
-    part = problem.rows(torch.tensor([2, 0, 0]))
-    assert part.lower is plain_hand.lower
-    torch.testing.assert_close(part.data, problem.data[[2, 0, 0]])
-    torch.testing.assert_close(part.valid, problem.valid[[2, 0, 0]])
-    torch.testing.assert_close(part.prior.mean, problem.prior.mean[[2, 0, 0]])
-    torch.testing.assert_close(part.prior.precision, problem.prior.precision)
-
-
 def precision_of(shape, std):
-    skin, pose = sample_skin(shape, 60), shape.rest_pose().unsqueeze(0)
-    data, valid = skin(pose), torch.ones(1, 60, dtype=torch.bool)
-    return centered_problem(skin, data, valid, pose, masked_mean(data, valid), prior_std=std, pose_atol=1e-3)
+    skin, pose = tr.sample_skin(shape, 60), shape.rest_pose().unsqueeze(0)
+    return problem_of(skin, skin(pose), pose, prior_std=std)
 
 
 def test_the_prior_holds_joints_slides_by_the_size_and_balls_as_a_whole(machine):
@@ -120,67 +75,16 @@ def test_the_prior_holds_joints_slides_by_the_size_and_balls_as_a_whole(machine)
     assert bool((precision_of(machine, None).prior.precision == 0).all())
 
 
-def test_joints_that_follow_a_slide_are_slides():
-    tree = KinematicTree((
-        Joint("palm", -1, offset(0, 0, 0)),
-        Joint("jaw", 0, offset(0.1, 0, 0), "prismatic", (1.0, 0.0, 0.0), 0.0, 0.1),
-        Joint("other", 0, offset(-0.1, 0, 0), "prismatic", (1.0, 0.0, 0.0), mimic=(1, -1.0, 0.0)),
-    ))  # fmt: skip
-    held = precision_of(ArticulatedShape(tree, ["palm", "jaw", "other"], [ROD] * 3, nu=0.01), 0.5)
-    assert held.prior.precision[6:].tolist() == pytest.approx([1 / (0.5 * held.size) ** 2])
-
-
-def test_shapes_with_a_mesh_are_fitted_by_it(plain_hand, problem):
-    assert isinstance(problem.surface, FusedSurface)
-    mesh = plain_hand.surface_mesh(spacing=0.01)
-    weights = torch.nn.functional.one_hot(torch.zeros(len(mesh.vertices)).long(), 16).float()
-    rigged = Hand().requires_grad_(False)
-    rigged.surface = RigSurface(mesh.vertices, mesh.faces, weights)
-    assert isinstance(precision_of(rigged, 0.3).surface, LinkSurface)
-    weights[0, :2] = 0.5
-    assert isinstance(precision_of(rigged, 0.3).surface, SkinSurface)
-
-
 def test_a_draw_takes_data_that_count_and_no_datum_twice(problem):
-    drawn = problem.draw(60, torch.Generator().manual_seed(0))
+    drawn = problem.draw(60, generator())
     assert drawn.data.shape == (3, 60, 3)
     assert drawn.valid.sum(-1).tolist() == [60, 60, 50]
     same = (drawn.data.unsqueeze(2) == problem.data.unsqueeze(1)).all(-1) & problem.valid.unsqueeze(1)
     assert bool((same.any(-1) == drawn.valid).all())
     assert all(len(drawn.data[row][drawn.valid[row]].unique(dim=0)) == count for row, count in enumerate((60, 60, 50)))
-    again = problem.draw(60, torch.Generator().manual_seed(0))
+    again = problem.draw(60, generator())
     torch.testing.assert_close(again.data, drawn.data, rtol=0, atol=0)
-    assert not torch.equal(problem.draw(60, torch.Generator().manual_seed(1)).data, drawn.data)
-
-
-def test_a_draw_of_more_than_there_are_is_all_of_them(problem):
-    drawn = problem.draw(1000, torch.Generator().manual_seed(0))
-    assert drawn.data.shape == problem.data.shape
-    assert drawn.valid.sum(-1).tolist() == [400, 300, 50]
-    torch.testing.assert_close(drawn.data.sum(1), problem.data.sum(1), rtol=0, atol=1e-5)
-
-
-def test_a_draw_leaves_the_global_state_alone(problem):
-    torch.manual_seed(3)
-    state = torch.get_rng_state()
-    problem.draw(10, torch.Generator().manual_seed(0))
-    assert bool((torch.get_rng_state() == state).all())
-
-
-def test_changes_are_radians_or_shares_of_the_size(problem):
-    step = torch.zeros(3, 27)
-    step[0, 1], step[1, 4], step[2, 20] = -0.5 * problem.size, -0.25, 0.125
-    torch.testing.assert_close(problem.change(step), torch.tensor([0.5, 0.25, 0.125]))
-
-
-def test_poses_are_clamped_between_the_limits(problem, plain_hand):
-    wild = 5 * torch.randn(7, 3, 27, generator=torch.Generator().manual_seed(0))
-    found = problem.clamp(wild)
-    inside = (wild >= plain_hand.lower) & (wild <= plain_hand.upper)
-    assert bool((found == wild)[inside].all())
-    at_limit = (found == plain_hand.lower) | (found == plain_hand.upper)
-    assert bool(at_limit[~inside].all())
-    torch.testing.assert_close(found[..., :6], wild[..., :6])
+    assert not torch.equal(problem.draw(60, generator(1)).data, drawn.data)
 
 
 def test_the_cost_counts_outliers_and_asks_the_prior(problem, plain_hand):
@@ -191,9 +95,9 @@ def test_the_cost_counts_outliers_and_asks_the_prior(problem, plain_hand):
     for row in range(3):
         total = 0.0
         for point in problem.data[row][problem.valid[row]]:
-            far = float(plain_hand.distance(point.unsqueeze(0), pose[row])) / (INLIER_SHARE * problem.size)
+            far = float(plain_hand.distance(point.unsqueeze(0), pose[row])) / (0.02 * problem.size)
             total += 1 - math.exp(-(far**2))
-        expected.append(total + PRIOR_SHARE * [0.0, 0.5, 2.0][row])
+        expected.append(total + 0.3 * [0.0, 0.5, 2.0][row])
     found = alignment_cost(problem, pose)
     assert found.tolist() == pytest.approx(expected, abs=2e-3)
     distances = problem.surface.distance(problem.data, pose)

@@ -6,18 +6,16 @@ import math
 import pytest
 import torch
 
-from torchreg.alignment.align import align
-from torchreg.alignment.config import AlignConfig
+import torchreg as tr
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
 from torchreg.alignment.person_gradient import PairedPlanes
-from torchreg.geometry.mesh import TriangleMesh, sample_surface
+from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
-from torchreg.storage import load
 
 D = torch.float64
 TRUTH = torch.tensor([0.8, -0.9, 0.7])
-QUICK = AlignConfig(num_model_points=150, search="never")
+QUICK = tr.AlignConfig(num_model_points=150, search="never")
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +25,24 @@ def scanned(person):
     pose = person.rest_pose()
     pose[6:] = math.radians(12) * torch.randn(len(pose) - 6, generator=generator)
     pose[:6] = torch.tensor([0.3, -0.2, 0.9, 0.1, -0.1, 0.15])
-    mesh = TriangleMesh(person.vertices(pose, TRUTH), person.surface.faces)
+    mesh = tr.TriangleMesh(person.vertices(pose, TRUTH), person.surface.faces)
     data = sample_surface(mesh, 700, generator=generator)[0]
     data = (data + 0.001 * torch.randn(data.shape, generator=generator)).requires_grad_()
-    return data, pose, align(person, data, pose, fit_shape=True, config=QUICK)
+    return data, pose, tr.align(person, data, pose, fit_shape=True, config=QUICK)
 
 
 def test_a_fit_has_gradients_where_the_data_have_and_the_same_numbers(person, scanned, tmp_path):
     data, pose, result = scanned
     assert result.pose.requires_grad
     assert result.coefficients.requires_grad
-    plain = align(person, data.detach(), pose, fit_shape=True, config=QUICK)
+    plain = tr.align(person, data.detach(), pose, fit_shape=True, config=QUICK)
     assert not plain.pose.requires_grad
     torch.testing.assert_close(result.pose.detach(), plain.pose)
     torch.testing.assert_close(result.coefficients.detach(), plain.coefficients)
     with torch.no_grad():
-        assert not align(person, data, pose, fit_shape=True, config=QUICK).pose.requires_grad
+        assert not tr.align(person, data, pose, fit_shape=True, config=QUICK).pose.requires_grad
     result.save(tmp_path / "r.safetensors")
-    assert torch.equal(load(tmp_path / "r.safetensors").pose, plain.pose)
+    assert torch.equal(tr.load(tmp_path / "r.safetensors").pose, plain.pose)
 
 
 def test_moving_all_data_moves_the_base_alone(scanned):
@@ -74,7 +72,7 @@ def test_stretching_the_data_changes_a_fit_as_a_fit_to_stretched_data(person, sc
     middle = result.pose[:3].detach()
     share = 0.01
     ahead, behind = (
-        align(person, middle + (1 + sign * share) * (data.detach() - middle), pose, fit_shape=True, config=QUICK)
+        tr.align(person, middle + (1 + sign * share) * (data.detach() - middle), pose, fit_shape=True, config=QUICK)
         for sign in (1, -1)
     )
     numeric = (ahead.coefficients - behind.coefficients) / (2 * share)

@@ -6,46 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.alignment.find_pose import FindPoseConfig
-from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
-from torchreg.datasets.hand import make_hand_cloud
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+import torchreg as tr
+from tests.alignment.made import D, cloud, finger
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import LinearBlendSkin, bending_weights, sample_skin
+from torchreg.shapes.skin import bending_weights
 
-D = torch.float64
-EXACT = PoseInitializerConfig(sigma_steps=1, em_steps=1, fit_steps=6, newton_steps=3, noise=0.004)
-
-
-def offset(*place):
-    pose = torch.eye(4, dtype=D)
-    pose[:3, 3] = torch.tensor(place, dtype=D)
-    return pose
-
-
-def finger():
-    """A lopsided body with a hinge: seven degrees of freedom."""
-    tree = KinematicTree((
-        Joint("body", -1, offset(0.0, 0.0, 0.0)),
-        Joint("finger", 0, offset(0.03, 0.0, 0.05), "revolute", (0.8, 0.6, 0.0), -0.5, 1.2),
-    ))  # fmt: skip
-    solids = [
-        Primitive("ellipsoid", (0.05, 0.03, 0.06), offset(0, 0.0, 0)),
-        Primitive("ellipsoid", (0.012, 0.015, 0.04), offset(0, 0, 0.04)),
-    ]
-    return ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004, dtype=D)
+EXACT = tr.PoseInitializerConfig(sigma_steps=1, em_steps=1, fit_steps=6, newton_steps=3, noise=0.004)
 
 
 @pytest.fixture(scope="module")
 def shape():
-    return finger().requires_grad_(False)
+    return finger()
 
 
 @pytest.fixture(scope="module")
 def skin(shape):
-    return sample_skin(shape, 60)
+    return tr.sample_skin(shape, 60)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +37,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def points(shape, truth):
-    cloud = sample_skin(shape, 60, seed=5)(truth)
+    cloud = tr.sample_skin(shape, 60, seed=5)(truth)
     return cloud + 0.002 * torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0), dtype=D)
 
 
@@ -90,10 +66,10 @@ def direction_like(value, seed):
 
 
 def test_poses_are_found_from_starts(shape, skin, points, start, truth):
-    layer = PoseInitializer(shape, model_points=skin)
+    layer = tr.PoseInitializer(shape, model_points=skin)
     with torch.no_grad():
         result = layer(points, start=start)
-    assert isinstance(result, InitialPose)
+    assert isinstance(result, tr.InitialPose)
     assert not result.pose.requires_grad
     torch.testing.assert_close(shape.keypoints(result.pose), shape.keypoints(truth), atol=2e-3, rtol=0)
     assert result.registered.shape == (3, 60, 3)
@@ -103,7 +79,7 @@ def test_poses_are_found_from_starts(shape, skin, points, start, truth):
 
 @pytest.mark.parametrize("which", ["points", "start"])
 def test_gradients_are_those_of_finite_differences(shape, skin, points, start, which):
-    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    layer = tr.PoseInitializer(shape, EXACT, model_points=skin)
     given = {"points": points, "start": start}
     leaf = given[which].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss_of(layer(**{**given, which: leaf})), leaf)
@@ -118,7 +94,7 @@ def test_gradients_are_those_of_finite_differences(shape, skin, points, start, w
 
 def test_gradients_in_the_sizes_of_the_shape(points, start):
     shape = finger().requires_grad_(True)
-    layer = PoseInitializer(shape, EXACT, model_points=sample_skin(shape, 60))
+    layer = tr.PoseInitializer(shape, EXACT, model_points=tr.sample_skin(shape, 60))
     scales = torch.nn.ParameterList([shape.log_length_scales, shape.log_radius_scales])
     gradients = torch.autograd.grad(loss_of(layer(points[2:], start=start[2:])), list(scales))
     direction = torch.tensor([1.0, -0.7, 0.5, 0.8], dtype=D)
@@ -136,10 +112,10 @@ def test_gradients_of_a_shape_whose_file_has_a_mesh(shape, points, start):
     mesh = shape.surface_mesh(spacing=0.006)
     weights = bending_weights(shape, mesh.vertices, shape.rest_pose(), 2.0)
     joints = shape.part_transforms(shape.rest_pose())[:, :3, 3]
-    rig = ArticulatedShape.from_skinned_mesh(
+    rig = tr.ArticulatedShape.from_skinned_mesh(
         mesh.vertices, mesh.faces, weights, joints, [-1, 0], axes={"joint_0": [], "joint_1": ["x"]}, dtype=D
     ).requires_grad_(False)
-    layer = PoseInitializer(rig, EXACT)
+    layer = tr.PoseInitializer(rig, EXACT)
     leaf = points[2:].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss_of(layer(leaf, start=start[2:])), leaf)
     direction = 0.01 * direction_like(leaf, 1)
@@ -151,7 +127,7 @@ def test_gradients_of_a_shape_whose_file_has_a_mesh(shape, points, start):
 
 def test_gradients_are_those_of_unrolling(shape, skin, points, start):
     """Descent with a fixed metric, every step of it kept: what the implicit function need not do."""
-    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    layer = tr.PoseInitializer(shape, EXACT, model_points=skin)
     leaf = points[2:].clone().requires_grad_()
     result = layer(leaf, start=start[2:])
     weights = direction_like(result.pose, 3)
@@ -182,8 +158,8 @@ def test_gradients_are_those_of_unrolling(shape, skin, points, start):
 def test_joints_held_at_a_limit_take_no_gradient(shape, skin, truth):
     beyond = truth.clone()
     beyond[:, 6] = shape.upper[6] + 0.3
-    points = sample_skin(shape, 60, seed=5)(beyond).requires_grad_()
-    result = PoseInitializer(shape, EXACT, model_points=skin)(points, start=shape.clamp(beyond))
+    points = tr.sample_skin(shape, 60, seed=5)(beyond).requires_grad_()
+    result = tr.PoseInitializer(shape, EXACT, model_points=skin)(points, start=shape.clamp(beyond))
     torch.testing.assert_close(result.pose[:, 6], shape.upper[6].expand(3), atol=1e-12, rtol=0)
     (gradient,) = torch.autograd.grad(result.pose[:, 6].sum(), points, retain_graph=True)
     assert not gradient.any()
@@ -195,7 +171,7 @@ def test_a_cloud_without_points_stays_at_its_start(shape, skin, points, start):
     mask[1] = False
     begin = start.clone().requires_grad_()
     cloud = points.clone().requires_grad_()
-    result = PoseInitializer(shape, EXACT, model_points=skin)(cloud, mask, begin)
+    result = tr.PoseInitializer(shape, EXACT, model_points=skin)(cloud, mask, begin)
     torch.testing.assert_close(result.pose[1], start[1], atol=1e-9, rtol=0)
     assert result.confidence[1] == 0
     weights = direction_like(start, 4)
@@ -210,14 +186,14 @@ def test_points_that_fall_together_have_gradients(shape, skin, points, start):
     cloud[:, 30:] = cloud[:, :30]
     cloud[0, 0] = start[0, :3]  # at the center of a solid
     leaf = cloud.requires_grad_()
-    result = PoseInitializer(shape, EXACT, model_points=skin)(leaf, start=start)
+    result = tr.PoseInitializer(shape, EXACT, model_points=skin)(leaf, start=start)
     (gradient,) = torch.autograd.grad(result.pose.sum(), leaf)
     assert gradient.isfinite().all()
     torch.testing.assert_close(gradient[1:, 30:], gradient[1:, :30], rtol=1e-6, atol=1e-9)
 
 
 def test_a_batch_is_its_clouds_one_by_one(shape, skin, points, start):
-    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    layer = tr.PoseInitializer(shape, EXACT, model_points=skin)
     leaf = points.clone().requires_grad_()
     together = layer(leaf, start=start)
     (gradient,) = torch.autograd.grad(together.pose.sum(), leaf)
@@ -232,53 +208,13 @@ def test_a_batch_is_its_clouds_one_by_one(shape, skin, points, start):
         torch.testing.assert_close(own, gradient[row], rtol=1e-5, atol=1e-8)
 
 
-def test_memory_does_not_grow_with_the_iterations(shape, skin, points, start):
-    """The graph that a forward pass leaves holds the same tensors after three steps as after sixty."""
-    sizes = []
-    for steps in (3, 60):
-        config = PoseInitializerConfig(sigma_steps=1, fit_steps=steps, newton_steps=1, noise=0.004)
-        saved = []
-
-        def pack(value, saved=saved):
-            saved.append(value.numel())
-            return value
-
-        with torch.autograd.graph.saved_tensors_hooks(pack, lambda value: value):
-            pose = PoseInitializer(shape, config, model_points=skin)(points.clone().requires_grad_(), start=start).pose
-        assert pose.requires_grad
-        sizes.append(sum(saved))
-    assert sizes[0] == sizes[1]
-
-
-def test_single_precision_and_half_precision_around_it(points, start):
-    shape = finger().float().requires_grad_(False)
-    layer = PoseInitializer(shape, EXACT, model_points=sample_skin(shape, 60))
-    double = finger().requires_grad_(False)
-    exact = PoseInitializer(double, EXACT, model_points=sample_skin(double, 60))
-    leaf, half = points.float().requires_grad_(), points.bfloat16().requires_grad_()
-    result = layer(leaf, start=start)
-    reference_leaf = points.clone().requires_grad_()
-    reference = exact(reference_leaf, start=start)
-    assert (result.keypoints.double() - reference.keypoints).norm(dim=-1).max() < 1e-4
-    gradient = torch.autograd.grad(result.keypoints.sum(), leaf)[0].double()
-    expected = torch.autograd.grad(reference.keypoints.sum(), reference_leaf)[0]
-    assert (gradient - expected).norm() < 1e-2 * expected.norm()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        rounded = layer(half, start=start)
-    assert rounded.pose.dtype == torch.float32
-    assert torch.autograd.grad(rounded.pose.sum(), half)[0].dtype == torch.bfloat16
-
-
 def test_hands_are_found_from_scratch(plain_hand, plain_hand_skin, plain_hand_surface):
     pose = plain_hand.rest_pose()
     pose[3:6], pose[6:] = torch.tensor([2.0, 1.0, -0.5]), 0.2 * plain_hand.upper[6:]
-    cloud = make_hand_cloud(
-        plain_hand, pose, num_points=300, noise=0.001, outlier_ratio=0.0, skin=plain_hand_surface,
-        generator=torch.Generator().manual_seed(0),
-    ).points  # fmt: skip
-    quick = FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1)
-    layer = PoseInitializer(plain_hand, PoseInitializerConfig(find_pose=quick), model_points=plain_hand_skin)
-    leaf = cloud.clone().requires_grad_()
+    points = cloud(plain_hand, pose, num_points=300, skin=plain_hand_surface).points
+    quick = tr.FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1)
+    layer = tr.PoseInitializer(plain_hand, tr.PoseInitializerConfig(find_pose=quick), model_points=plain_hand_skin)
+    leaf = points.clone().requires_grad_()
     result = layer(leaf)
     error = (result.keypoints - plain_hand.keypoints(pose)).norm(dim=-1)
     assert error.mean() < 5e-3
@@ -286,19 +222,6 @@ def test_hands_are_found_from_scratch(plain_hand, plain_hand_skin, plain_hand_su
     shift = torch.autograd.grad(result.pose[:3].sum(), leaf)[0].sum(0)
     # Points that all move alike take the hand along.
     torch.testing.assert_close(shift, torch.ones(3), atol=5e-2, rtol=0)
-
-
-def test_from_scratch_a_cloud_of_a_batch_may_be_empty(shape, skin, points):
-    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
-    layer = PoseInitializer(shape, PoseInitializerConfig(find_pose=quick), model_points=skin)
-    mask = torch.ones(3, 60, dtype=torch.bool)
-    mask[1] = False
-    with torch.no_grad():
-        result, alone = layer(points, mask), layer(points[2])
-    assert result.pose.isfinite().all()
-    assert result.confidence[1] == 0
-    torch.testing.assert_close(result.keypoints[2], alone.keypoints, atol=1e-6, rtol=0)
-    torch.testing.assert_close(result.confidence[2], alone.confidence, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -310,11 +233,11 @@ def test_from_scratch_a_cloud_of_a_batch_may_be_empty(shape, skin, points):
 )
 def test_a_copy_on_any_device_finds_the_same(shape, skin, points, start, device):
     """From starts with gradients, and from scratch without."""
-    other = finger().requires_grad_(False).to(device)
-    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
+    other = finger().to(device)
+    quick = tr.FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
     config = replace(EXACT, find_pose=quick)
-    layer, there = PoseInitializer(shape, config, model_points=skin), PoseInitializer(other, config)
-    there.skin = LinearBlendSkin(other, skin.points.to(device), skin.weights.to(device), other.rest_pose())
+    layer, there = tr.PoseInitializer(shape, config, model_points=skin), tr.PoseInitializer(other, config)
+    there.skin = tr.LinearBlendSkin(other, skin.points.to(device), skin.weights.to(device), other.rest_pose())
     leaf, leaf_there = points.clone().requires_grad_(), points.to(device).requires_grad_()
     found, found_there = layer(leaf, start=start), there(leaf_there, start=start.to(device))
     assert found_there.pose.device.type == device

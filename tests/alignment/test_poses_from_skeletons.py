@@ -4,11 +4,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.find_pose import find_pose
-from torchreg.geometry.mesh import TriangleMesh
+from tests.alignment.made import TIPS, make_problem
 from torchreg.geometry.skeleton import build_skeleton
-
-TIPS = [4, 8, 12, 16, 20]
 
 
 def bent_pose(hand, seed):
@@ -38,7 +35,7 @@ def test_the_pose_is_found_from_the_limbs_alone(plain_hand, plain_hand_skin, pla
     pose = bent_pose(plain_hand, seed)
     data = plain_hand_surface(pose)[::7]
     source = tr.SpineLimbs(hand_skeleton(plain_hand, pose, forearm=forearm))
-    starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
+    starts = tr.find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
     error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
     assert float(error.mean()) < 0.003
 
@@ -46,15 +43,15 @@ def test_the_pose_is_found_from_the_limbs_alone(plain_hand, plain_hand_skin, pla
 def test_the_skeleton_of_a_surface_will_do(plain_hand, plain_hand_skin, plain_hand_surface):
     pose = bent_pose(plain_hand, 4)
     data = plain_hand_surface(pose)[::7]
-    mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
+    mesh = tr.TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
     source = tr.SpineLimbs.of_surface(mesh, count=1)
     assert len(source.skeleton.tips) == 6
-    starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
+    starts = tr.find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
     error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
     assert float(error.mean()) < 0.003
 
 
-def test_a_batch_of_clouds_shares_the_skeleton(plain_hand, plain_hand_skin, plain_hand_surface, make_problem):
+def test_a_batch_of_clouds_shares_the_skeleton(plain_hand, plain_hand_skin, plain_hand_surface):
     pose = bent_pose(plain_hand, 1)
     cloud = plain_hand_surface(pose)[::7]
     origin = torch.stack([cloud.mean(0), cloud[200:].mean(0) + 0.1])

@@ -3,35 +3,17 @@
 import pytest
 import torch
 
-from torchreg.alignment.find_pose import FindPoseConfig
-from torchreg.alignment.pose_initializer import PoseInitializer, PoseInitializerConfig
+import torchreg as tr
+from tests.alignment.made import finger
 from torchreg.alignment.pseudo_labels import label_frames
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import sample_skin
 
-QUICK = FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search_rounds=1)
-
-
-def offset(*place):
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = torch.tensor(place, dtype=torch.float64)
-    return pose
+QUICK = tr.FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search_rounds=1)
 
 
 @pytest.fixture(scope="module")
 def layer():
-    tree = KinematicTree((
-        Joint("body", -1, offset(0.0, 0.0, 0.0)),
-        Joint("finger", 0, offset(0.03, 0.0, 0.05), "revolute", (1.0, 0.0, 0.0), -0.5, 1.2),
-    ))  # fmt: skip
-    solids = [
-        Primitive("ellipsoid", (0.05, 0.03, 0.06), offset(0, 0, 0)),
-        Primitive("ellipsoid", (0.012, 0.015, 0.04), offset(0, 0, 0.04)),
-    ]
-    shape = ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004).requires_grad_(False)
-    return PoseInitializer(shape, PoseInitializerConfig(find_pose=QUICK), model_points=sample_skin(shape, 80))
+    shape = finger(dtype=torch.float32)
+    return tr.PoseInitializer(shape, tr.PoseInitializerConfig(find_pose=QUICK), model_points=tr.sample_skin(shape, 80))
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +21,7 @@ def motion(layer):
     poses = torch.zeros(3, 7)
     poses[:, 0] = torch.tensor([0.3, 0.303, 0.9])  # the last one jumps
     poses[:, 6] = torch.tensor([0.2, 0.25, 0.8])
-    return poses, sample_skin(layer.shape, 120, seed=4)(poses)
+    return poses, tr.sample_skin(layer.shape, 120, seed=4)(poses)
 
 
 def test_frames_follow_one_another_and_are_searched_after_a_jump(layer, motion):

@@ -6,14 +6,11 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.alignment.made import joint, problem_of, shape_of, solid
 from torchreg.alignment.curvature import correlated_count, curvature, neighbor_correlation
-from torchreg.alignment.problem import centered_problem, masked_mean
-from torchreg.alignment.reliability import CALIBRATION, Evidence, confidence_of, judge
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.alignment.reliability import judge
 from torchreg.geometry.sampling import farthest_points
-from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import difference
-from torchreg.shapes.primitives import Primitive
 
 
 def lattice(count=30):
@@ -37,13 +34,6 @@ def test_independent_residuals_count_each_and_smooth_ones_together():
     assert float(correlated(data, ones, ones)) > 50
 
 
-def test_no_evidence_against_a_pose_is_the_highest_confidence():
-    none = torch.zeros(1, len(CALIBRATION.weights))
-    worse = torch.eye(len(CALIBRATION.weights))
-    assert float(confidence_of(none)) == pytest.approx(float(torch.sigmoid(torch.tensor(CALIBRATION.bias))))
-    assert bool((confidence_of(worse) <= confidence_of(none)).all())
-
-
 @pytest.fixture(scope="module")
 def measured(links, links_skin):
     """Points of the links in a pose, 2 mm noise, and their alignment in the pose's coordinates."""
@@ -54,15 +44,9 @@ def measured(links, links_skin):
     return pose, data
 
 
-def problem_of(skin, data, pose):
-    valid = torch.ones(1, len(data), dtype=torch.bool)
-    zero = torch.zeros(1, 3, dtype=torch.float64)
-    return centered_problem(skin, data[None], valid, pose[None], zero, prior_std=0.3, pose_atol=1e-3)
-
-
 def test_evidence_is_none_at_the_truth_and_speaks_against_a_wrong_pose(links, links_skin, measured):
     pose, data = measured
-    problem = problem_of(links_skin, data, pose)
+    problem = problem_of(links_skin, data[None], pose[None], prior_std=0.3, pose_atol=1e-3)
     right = judge(problem, pose[None], None)
     wrong_pose = pose.clone()
     wrong_pose[6] = -0.8
@@ -72,14 +56,13 @@ def test_evidence_is_none_at_the_truth_and_speaks_against_a_wrong_pose(links, li
     assert float(wrong.evidence.rival) == 1
     assert float(right.evidence.rival) == 0
     assert float(right.confidence) > float(wrong.confidence)
-    assert right.evidence.table().shape == (1, len(CALIBRATION.weights))
 
 
 def test_a_fit_has_converged_where_another_step_gains_nothing(links, links_skin, measured):
     pose, data = measured
     found = tr.align(links, data, pose, model_points=links_skin, config=tr.AlignConfig(search="never"))
     assert found.status is tr.Status.CONVERGED
-    problem = problem_of(links_skin, data, pose)
+    problem = problem_of(links_skin, data[None], pose[None], prior_std=0.3, pose_atol=1e-3)
     assert bool(curvature(problem, found.pose[None]).converged)
     off = links.retract(found.pose[None], torch.full_like(pose[None], 0.02))
     assert not bool(curvature(problem, off).converged)
@@ -111,17 +94,15 @@ def test_the_covariance_is_that_of_repeated_measurements(links, links_skin, meas
 
 def test_one_datum_on_a_handle_tells_no_turn_surely():
     """Of a round knob it alone would tell how far it is turned, and may be there by chance; ten tell."""
-    eye = torch.eye(4, dtype=torch.float64)
-    turn = Joint("knob", 0, eye, "revolute", (0.0, 0.0, 1.0), -3.0, 3.0)
-    joints = Joint("base", -1, eye), turn, Joint("handle", 1, eye)
-    knob, handle = eye.clone(), eye.clone()
-    knob[2, 3], handle[:3, 3] = 0.1, torch.tensor([0.1, 0.0, 0.1])
-    solids = [
-        Primitive("ellipsoid", (0.05, 0.08, 0.06), eye), Primitive("ellipsoid", (0.07, 0.07, 0.04), knob),
-        Primitive("ellipsoid", (0.04, 0.01, 0.01), handle),
+    joints = [
+        joint("base", -1), joint("knob", 0, (0, 0, 0), "revolute", (0.0, 0.0, 1.0), -3.0, 3.0), joint("handle", 1),
     ]  # fmt: skip
-    shape = ArticulatedShape(KinematicTree(joints), ["base", "knob", "handle"], solids, nu=0.003, dtype=torch.float64)
-    skin = tr.sample_skin(shape.requires_grad_(False), 600)
+    solids = [
+        solid("ellipsoid", (0.05, 0.08, 0.06)), solid("ellipsoid", (0.07, 0.07, 0.04), 0, 0, 0.1),
+        solid("ellipsoid", (0.04, 0.01, 0.01), 0.1, 0, 0.1),
+    ]  # fmt: skip
+    shape = shape_of(joints, solids, nu=0.003, dtype=torch.float64)
+    skin = tr.sample_skin(shape, 600)
     pose = shape.rest_pose()
     noise = 0.001 * torch.randn(len(skin), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     data = skin(pose) + noise
@@ -129,7 +110,11 @@ def test_one_datum_on_a_handle_tells_no_turn_surely():
 
     def std(count):
         seen = torch.cat((data[~on_handle & (data[:, 0] < 0.06)], data[on_handle][:count]))
-        return float(curvature(problem_of(skin, seen, pose), pose[None]).covariance[0, 6, 6].sqrt())
+        return float(
+            curvature(problem_of(skin, seen[None], pose[None], prior_std=0.3, pose_atol=1e-3), pose[None])
+            .covariance[0, 6, 6]
+            .sqrt()
+        )
 
     assert std(1) > 0.5 * std(0)
     assert std(10) < 0.2 * std(0)
@@ -156,7 +141,7 @@ def test_joints_that_no_data_determine_are_named_whatever_the_status(tmp_path, s
     names = "name", "solid", "joint", "kind", "parent", "height", "axis"
     rows = [LINK.format(**dict(zip(names, link, strict=True))) for link in links]
     (tmp_path / "arm.urdf").write_text(ROBOT.format(links="".join(rows)))
-    arm = ArticulatedShape.from_urdf(tmp_path / "arm.urdf", free_base=False)
+    arm = tr.ArticulatedShape.from_urdf(tmp_path / "arm.urdf", free_base=False)
     pose = arm.pose_from_dict({"lift": 0.6, "roll": 0.4})
     skin = tr.sample_skin(arm, 900)
     kept = torch.ones(len(skin), dtype=torch.bool) if seen else skin.weights.argmax(-1) < 2
@@ -209,17 +194,9 @@ def test_doubts_name_the_limb_and_the_reason(plain_hand, plain_hand_skin):
     part = plain_hand_skin.weights.argmax(-1)
     hidden = [number for number, name in enumerate(plain_hand.part_names) if name.startswith("ring")]
     data = plain_hand_skin(pose)[:, ~torch.isin(part, torch.tensor(hidden))]
-    valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-    problem = centered_problem(
-        plain_hand_skin, data, valid, pose, masked_mean(data, valid), prior_std=0.4, pose_atol=1e-3
-    )
+    problem = problem_of(plain_hand_skin, data, pose, origin=data.mean(1), pose_atol=1e-3)
     local = pose.clone()
     local[:, :3] -= problem.origin
     (told,) = judge(problem, local, pose.new_tensor([0.0])).doubt
     assert "hardly any data show where ring ends" in told
     assert "another pose explains nearly as much" in told
-
-
-def test_every_number_of_the_evidence_has_a_weight():
-    assert len(Evidence.__dataclass_fields__) == len(CALIBRATION.weights)
-    assert min(CALIBRATION.weights) >= 0

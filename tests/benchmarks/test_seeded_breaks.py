@@ -7,9 +7,8 @@ SOURCE = """def near(a, b, c):
 
 
 @pytest.fixture(scope="module")
-def bench(loaded_benchmark):
-    with loaded_benchmark("seeded_breaks") as module:
-        yield module
+def bench(load):
+    return load("seeded_breaks")
 
 
 @pytest.fixture

@@ -7,10 +7,11 @@ import torch
 
 import torchreg as tr
 from torchreg.capture.free_space import FreeSpace
-from torchreg.errors import FormatError, InputError, InputTypeError
-from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.geometry.rigid import se3_exp
 from torchreg.io.calibration import save_depth_camera
 from torchreg.io.images import save_depth, save_image
+
+FormatError, InputError, InputTypeError = tr.errors.FormatError, tr.errors.InputError, tr.errors.InputTypeError
 
 MOTION = se3_exp(torch.tensor([0.1, -0.2, 0.1, 0.2, -0.4, 0.1], dtype=torch.float64))
 LENS = (-0.1, 0.03, 1e-3, -2e-3)
@@ -89,7 +90,7 @@ def test_nothing_is_known_behind_the_camera_and_in_holes():
     depth, mask = wall_with_box()
     depth[20, 30] = 0.0
     space = tr.DepthFrame(depth, CAMERA, mask).free_space
-    behind = transform_points(torch.linalg.inv(MOTION), depth.new_tensor([[0.0, 0.0, -1.0]]))
+    behind = torch.linalg.solve(MOTION, depth.new_tensor([0.0, 0.0, -1.0, 1.0]))[None, :3]
     points = torch.cat([behind, at_pixels(CAMERA, [30.0], [20.0], [0.5])])
     assert space.intrusion(points[None]).tolist() == [[0.0, 0.0]]
 
@@ -164,7 +165,11 @@ def test_files_make_a_frame(tmp_path):
         ({"depth": torch.ones(48, 63)}, InputError, r"depth must have shape \(48, 64\), got \(48, 63\)"),
         ({"depth": torch.zeros(48, 64)}, InputError, "got 0 of 384 pixels of the mask measured"),
         ({"depth": torch.full((48, 64), torch.nan)}, InputError, "got 0 of 384 pixels of the mask measured"),
-        ({"depth": torch.full((48, 64), 570.0)}, InputError, "must be in metres, got 570 in the middle; multiply"),
+        (
+            {"depth": torch.full((48, 64), 570.0)},
+            InputError,
+            "must be in metres, got 570 in the middle; multiply",
+        ),
         ({"camera": "k.json"}, InputTypeError, "camera must be a Camera, got str"),
         ({"mask": torch.ones(48, 64)}, InputTypeError, "mask must hold bool"),
         ({"mask": torch.ones(48, 60, dtype=torch.bool)}, InputError, r"mask must have shape \(48, 64\)"),

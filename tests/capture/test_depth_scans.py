@@ -4,24 +4,15 @@ import math
 import pytest
 import torch
 
-from torchreg.capture.depth import (
-    bilateral_filter,
-    depth_scan,
-    fuse_scans,
-    load_depth_scan,
-    plane_normals,
-    without_flying_pixels,
-)
+import torchreg as tr
+from torchreg.capture.depth import bilateral_filter, plane_normals, without_flying_pixels
 from torchreg.capture.depth_noise import DepthNoise
-from torchreg.errors import FormatError, InputError
-from torchreg.geometry.camera import Camera
-from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp
 from torchreg.io.calibration import save_depth_camera
 from torchreg.io.images import save_depth
 
 MOTION = se3_exp(torch.tensor([0.1, -0.2, 0.1, 0.2, -0.4, 0.1], dtype=torch.float64))
-CAMERA = Camera(160, 120, (150.0, 150.0, 80.0, 59.0), MOTION)
+CAMERA = tr.Camera(160, 120, (150.0, 150.0, 80.0, 59.0), MOTION)
 RADIUS = 0.25
 
 
@@ -43,7 +34,7 @@ def angles(first, second):
 
 def test_points_reproject_into_their_pixels_and_lie_on_the_sphere():
     depth, _ = solid("sphere")
-    scan = depth_scan(depth, CAMERA)
+    scan = tr.depth_scan(depth, CAMERA)
     pixels, _ = CAMERA.project(scan.points)
     assert (pixels - pixels.round()).abs().max() < 1e-6
     assert torch.allclose(scan.viewpoint, CAMERA.position)
@@ -56,7 +47,7 @@ def test_points_reproject_into_their_pixels_and_lie_on_the_sphere():
 def test_normals_are_within_five_degrees_in_spite_of_noise(kind, noise):
     depth, normals = solid(kind)
     noisy = noise.measured(depth, torch.Generator().manual_seed(3))
-    scan = depth_scan(noisy, CAMERA, smoothing=float(noise.depth_std(torch.ones(()))))
+    scan = tr.depth_scan(noisy, CAMERA, smoothing=float(noise.depth_std(torch.ones(()))))
     pixels, _ = CAMERA.project(scan.points)
     column, row = pixels.round().long().unbind(-1)
     true = normals[row, column] @ CAMERA.world_to_camera[:3, :3]
@@ -65,8 +56,8 @@ def test_normals_are_within_five_degrees_in_spite_of_noise(kind, noise):
 
 
 def test_lens_is_undone():
-    lens = Camera(160, 120, CAMERA.intrinsics, MOTION, (-0.3, 0.1, 0.0, 0.0))
-    scan = depth_scan(torch.full((120, 160), 1.0, dtype=torch.float64), lens)
+    lens = tr.Camera(160, 120, CAMERA.intrinsics, MOTION, (-0.3, 0.1, 0.0, 0.0))
+    scan = tr.depth_scan(torch.full((120, 160), 1.0, dtype=torch.float64), lens)
     pixels, depth = lens.project(scan.points)
     assert (pixels - pixels.round()).abs().max() < 1e-6
     assert torch.allclose(depth, torch.ones_like(depth))
@@ -132,65 +123,70 @@ def test_plane_normals_are_exact_on_planes():
 
 def test_depth_range_cuts_the_background():
     depth, _ = solid("sphere")
-    scan = depth_scan(torch.where(depth > 0, depth, 3.0), CAMERA, farthest=1.0, nearest=0.1)
+    scan = tr.depth_scan(torch.where(depth > 0, depth, 3.0), CAMERA, farthest=1.0, nearest=0.1)
     assert len(scan) <= (depth > 0).sum()
-    with pytest.raises(InputError, match="farthest must be beyond nearest"):
-        depth_scan(depth, CAMERA, farthest=1.0, nearest=2.0)
-    with pytest.raises(InputError, match=r"depth must have shape \(120, 160\)"):
-        depth_scan(depth[:5], CAMERA)
-    with pytest.raises(InputError, match="depth must hold neighboring pixels"):
-        depth_scan(depth, CAMERA, nearest=2.0)
-    with pytest.raises(InputError, match="smoothing must be zero or positive"):
-        depth_scan(depth, CAMERA, smoothing=-1.0)
-    with pytest.raises(InputError, match="max_steepness must be positive"):
-        depth_scan(depth, CAMERA, max_steepness=0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"farthest": 1.0, "nearest": 2.0}, "farthest must be beyond nearest"),
+        ({"depth": torch.ones(5, 160)}, r"depth must have shape \(120, 160\)"),
+        ({"nearest": 2.0}, "depth must hold neighboring pixels"),
+        ({"smoothing": -1.0}, "smoothing must be zero or positive"),
+        ({"max_steepness": 0.0}, "max_steepness must be positive"),
+    ],
+)
+def test_bad_input_is_named(change, words):
+    with pytest.raises(tr.errors.InputError, match=words):
+        tr.depth_scan(**{"depth": solid("sphere")[0], "camera": CAMERA, **change})
 
 
 def test_views_from_all_sides_fuse_into_one_sphere():
     scans = []
     for angle in (0.0, 2.0, 4.0):
         place = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], dtype=torch.float64)
-        camera = Camera.looking_at(place, [0.0, 0.0, 0.0], focal=100.0, width=80, height=80)
+        camera = tr.Camera.looking_at(place, [0.0, 0.0, 0.0], focal=100.0, width=80, height=80)
         rays = camera.directions(camera.pixel_grid())
         a, b = (rays**2).sum(-1), (rays @ -place)
         inside = b**2 - a * (1 - 0.3**2)
         depth = torch.where(inside > 0, (b - inside.clamp(min=0).sqrt()) / a, 0.0)
-        scans.append(depth_scan(depth, camera))
-    fused = fuse_scans(scans)
+        scans.append(tr.depth_scan(depth, camera))
+    fused = tr.fuse_scans(scans)
     total = sum(len(scan) for scan in scans)
     assert len(scans[0]) < len(fused) < total
     assert (fused.points.norm(dim=-1) - 0.3).abs().max() < 2e-3
     assert angles(fused.normals, fused.points / fused.points.norm(dim=-1, keepdim=True)).median() < 2.0
-    assert len(fuse_scans(scans, spacing=0.05)) < len(fused)
-    with pytest.raises(InputError, match="at least one scan"):
-        fuse_scans([])
-    with pytest.raises(InputError, match="leave three points"):
-        fuse_scans([RangeScan(torch.eye(3, dtype=torch.float64))], spacing=10.0)
+    assert len(tr.fuse_scans(scans, spacing=0.05)) < len(fused)
+    with pytest.raises(tr.errors.InputError, match="at least one scan"):
+        tr.fuse_scans([])
+    with pytest.raises(tr.errors.InputError, match="leave three points"):
+        tr.fuse_scans([tr.RangeScan(torch.eye(3, dtype=torch.float64))], spacing=10.0)
 
 
 def test_two_sides_of_a_sheet_stay_apart():
     grid = torch.cartesian_prod(torch.arange(10.0), torch.arange(10.0), torch.zeros(1))
     up = torch.tensor([0.0, 0.0, 1.0]).expand(100, 3)
-    sides = [RangeScan(grid, normals=up), RangeScan(grid + torch.tensor([0.0, 0.0, 0.1]), normals=-up)]
-    assert len(fuse_scans(sides, spacing=0.99)) == 200
+    sides = [tr.RangeScan(grid, normals=up), tr.RangeScan(grid + torch.tensor([0.0, 0.0, 0.1]), normals=-up)]
+    assert len(tr.fuse_scans(sides, spacing=0.99)) == 200
 
 
 def test_files_become_scans(tmp_path):
     depth, _ = solid("sphere")
     save_depth(tmp_path / "d.png", depth, 1e-4)
     save_depth_camera(tmp_path / "k.json", CAMERA, 1e-4)
-    scan = load_depth_scan(tmp_path / "d.png", tmp_path / "k.json")
-    exact = depth_scan(depth, CAMERA)
+    scan = tr.load_depth_scan(tmp_path / "d.png", tmp_path / "k.json")
+    exact = tr.depth_scan(depth, CAMERA)
     assert len(scan) > 0.95 * len(exact)
     pixels, _ = CAMERA.project(scan.points.double())
     assert (pixels - pixels.round()).abs().max() < 0.5
-    with pytest.raises(FormatError, match=r"d\.png: depth must hold neighboring pixels"):
-        load_depth_scan(tmp_path / "d.png", tmp_path / "k.json", nearest=5.0)
-    with pytest.raises(InputError, match="max_jump must be positive"):
-        load_depth_scan(tmp_path / "d.png", tmp_path / "k.json", max_jump=0.0)
+    with pytest.raises(tr.errors.FormatError, match=r"d\.png: depth must hold neighboring pixels"):
+        tr.load_depth_scan(tmp_path / "d.png", tmp_path / "k.json", nearest=5.0)
+    with pytest.raises(tr.errors.InputError, match="max_jump must be positive"):
+        tr.load_depth_scan(tmp_path / "d.png", tmp_path / "k.json", max_jump=0.0)
     (tmp_path / "k.json").write_text(json.dumps({"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 0, "cy": 0}))
-    with pytest.raises(FormatError, match="is 160 x 120 pixels, the camera's pictures are 1 x 1"):
-        load_depth_scan(tmp_path / "d.png", tmp_path / "k.json")
+    with pytest.raises(tr.errors.FormatError, match="is 160 x 120 pixels, the camera's pictures are 1 x 1"):
+        tr.load_depth_scan(tmp_path / "d.png", tmp_path / "k.json")
 
 
 @pytest.mark.parametrize("noise", [DepthNoise.structured_light(), DepthNoise.time_of_flight()])
@@ -240,7 +236,7 @@ def test_nothing_stays_nothing_and_seeds_decide():
 
 
 def test_numbers_are_checked():
-    with pytest.raises(InputError, match="quadratic must be zero or positive"):
+    with pytest.raises(tr.errors.InputError, match="quadratic must be zero or positive"):
         DepthNoise(quadratic=-1.0)
-    with pytest.raises(InputError, match="flying is a share"):
+    with pytest.raises(tr.errors.InputError, match="flying is a share"):
         DepthNoise(flying=1.5)

@@ -3,9 +3,9 @@ import sys
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.capture.disparity import census, match_disparity
 from torchreg.capture.disparity_refinement import refine_disparity
-from torchreg.errors import MissingExtraError
 
 
 def textured(height, width, seed=0):
@@ -71,7 +71,7 @@ def test_census_ignores_brightness_and_counts_darker_neighbors():
 def test_a_missing_opencv_is_told_with_its_extra(monkeypatch):
     left, right, _ = scene()
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtraError, match=r"torchreg-articulated\[stereo\]"):
+    with pytest.raises(tr.errors.MissingExtraError, match=r"torchreg-articulated\[stereo\]"):
         match_disparity(left, right, 20, method="opencv")
 
 

@@ -1,22 +1,22 @@
 import pytest
 import torch
 
+import torchreg as tr
 from experiments.made_up.pictures import PictureStyle, render, stereo_cameras
-from torchreg.capture.stereo import StereoConfig, StereoPoints, rectify, stereo_points
-from torchreg.capture.stereo_frames import StereoFrames, far_end
-from torchreg.errors import FormatError, InputError
-from torchreg.geometry.camera import Camera
-from torchreg.geometry.camera_rig import StereoPair
-from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.capture.stereo import StereoPoints, rectify
+from torchreg.capture.stereo_frames import far_end
+from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.rigid import se3_exp
 from torchreg.io.images import save_image
 
-NEAR = StereoConfig(nearest=0.4, farthest=1.0)
+FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
+
+NEAR = tr.StereoConfig(nearest=0.4, farthest=1.0)
 
 
 def ball_before(cameras, style=None):
     mesh = unit_sphere(4, dtype=torch.float64)
-    mesh = TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.0, 0.0, 0.6]), mesh.faces)
+    mesh = tr.TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.0, 0.0, 0.6]), mesh.faces)
     generator = torch.Generator().manual_seed(0)
     style = PictureStyle(wall=0.85) if style is None else style
     return [render(mesh, camera, style=style, generator=generator) for camera in cameras]
@@ -26,7 +26,7 @@ def ball_before(cameras, style=None):
 def scene():
     pair = stereo_cameras(width=200, height=150, focal=240.0)
     left, right = ball_before((pair.left, pair.right))
-    return pair, left, right, stereo_points(left.image, right.image, pair, config=NEAR)
+    return pair, left, right, tr.stereo_points(left.image, right.image, pair, config=NEAR)
 
 
 def errors(scene, found):
@@ -66,22 +66,24 @@ def test_covariance_is_that_of_the_depth_along_the_ray(scene):
 
 def test_background_goes_by_depth_and_by_volume(scene):
     pair, left, right, found = scene
-    near = stereo_points(left.image, right.image, pair, config=StereoConfig(nearest=0.4, farthest=0.7, both=False))
+    near = tr.stereo_points(
+        left.image, right.image, pair, config=tr.StereoConfig(nearest=0.4, farthest=0.7, both=False)
+    )
     assert 0 < len(near) < len(found)
     assert near.points[:, 2].max() < 0.71
     box = torch.tensor([[0.0, -1.0, 0.0], [1.0, 1.0, 2.0]])
-    half = stereo_points(left.image, right.image, pair, config=NEAR, box=box)
+    half = tr.stereo_points(left.image, right.image, pair, config=NEAR, box=box)
     assert 0 < len(half) < len(found)
     assert (half.points[:, 0] >= 0).all()
-    few = stereo_points(left.image, right.image, pair, config=StereoConfig(num_corners=20))
+    few = tr.stereo_points(left.image, right.image, pair, config=tr.StereoConfig(num_corners=20))
     assert len(few) == 20
 
 
 def test_textured_places_stand_in_for_corners(scene):
     pair, left, right, found = scene
     least = len(found) + 100
-    config = StereoConfig(nearest=0.4, farthest=1.0, least=least)
-    more = stereo_points(left.image, right.image, pair, config=config)
+    config = tr.StereoConfig(nearest=0.4, farthest=1.0, least=least)
+    more = tr.stereo_points(left.image, right.image, pair, config=config)
     assert len(more) >= len(found) + 50
     error, _ = errors(scene, more)
     assert error.median() < 3e-3
@@ -91,22 +93,20 @@ def test_textured_places_stand_in_for_corners(scene):
     added = torch.tensor([pixel for pixel in more.pixels.tolist() if tuple(pixel) not in corners])
     apart = torch.cdist(added, more.pixels, p=torch.inf)
     assert apart[apart > 0].min() >= 3
-    with pytest.raises(InputError, match="least must be at most num_corners"):
-        StereoConfig(num_corners=20, least=30)
 
 
 def test_rectified_pictures_of_a_turned_pair_with_lenses_match():
     pair = stereo_cameras(width=200, height=150, focal=240.0)
     twist = torch.tensor([0.0, 0.004, 0.002, 0.02, -0.03, 0.02], dtype=torch.float64)
-    turned = Camera(200, 150, pair.right.intrinsics + 1, se3_exp(twist) @ pair.right.world_to_camera)
-    crooked = StereoPair(pair.left, turned)
+    turned = tr.Camera(200, 150, pair.right.intrinsics + 1, se3_exp(twist) @ pair.right.world_to_camera)
+    crooked = tr.StereoPair(pair.left, turned)
     left, right = ball_before((crooked.left, crooked.right))
     with pytest.raises(InputError, match="is not rectified"):
-        stereo_points(left.image, right.image, crooked, config=NEAR)
+        tr.stereo_points(left.image, right.image, crooked, config=NEAR)
     first, second, straight = rectify(left.image, right.image, crooked)
     assert straight.is_rectified
     assert straight.baseline == pytest.approx(crooked.baseline)
-    found = stereo_points(first, second, straight, config=NEAR)
+    found = tr.stereo_points(first, second, straight, config=NEAR)
     # Ball or wall: the points lie on one of them.
     off = torch.minimum(
         ((found.points - found.points.new_tensor([0.0, 0.0, 0.6])).norm(dim=-1) - 0.1).abs(),
@@ -118,9 +118,9 @@ def test_rectified_pictures_of_a_turned_pair_with_lenses_match():
 
 def test_rectify_undoes_lenses():
     pair = stereo_cameras(width=60, height=40, focal=60.0)
-    bent = Camera(60, 40, pair.left.intrinsics, pair.left.world_to_camera, (-0.2, 0.05, 0.0, 0.0))
+    bent = tr.Camera(60, 40, pair.left.intrinsics, pair.left.world_to_camera, (-0.2, 0.05, 0.0, 0.0))
     ramp = pair.left.pixel_grid()[..., 0] / 60
-    first, _, straight = rectify(ramp, ramp.unsqueeze(-1).expand(-1, -1, 3), StereoPair(bent, pair.right))
+    first, _, straight = rectify(ramp, ramp.unsqueeze(-1).expand(-1, -1, 3), tr.StereoPair(bent, pair.right))
     assert straight.is_rectified
     source, _ = bent.project(bent.position + straight.left.directions(straight.left.pixel_grid()))
     inner = (slice(10, 30), slice(10, 50))
@@ -130,25 +130,46 @@ def test_rectify_undoes_lenses():
 def test_swapped_strange_and_wrongly_sized_pictures_are_refused(scene):
     pair, left, right, _ = scene
     with pytest.raises(InputError, match="left and right pictures are swapped"):
-        stereo_points(right.image, left.image, pair, config=NEAR)
-    noise = torch.rand(2, 150, 200, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(InputError, match="left and right hardly match"):
-        stereo_points(noise[0], noise[1], pair, config=NEAR)
-    with pytest.raises(InputError, match=r"right must have shape \(150, 200\)"):
-        stereo_points(noise[0], noise[1, 1:], pair, config=NEAR)
-    with pytest.raises(InputError, match="left must be finite"):
-        stereo_points(noise[0] / 0, noise[1], pair, config=NEAR)
-    with pytest.raises(InputError, match="nearest must keep disparities within the picture"):
-        stereo_points(noise[0], noise[1], pair, config=StereoConfig(nearest=0.05))
-    with pytest.raises(InputError, match="farthest must be beyond nearest"):
-        StereoConfig(nearest=1.0, farthest=0.5)
-    with pytest.raises(InputError, match="method must be one of semi-global, block, opencv; got 'magic'"):
-        StereoConfig(method="magic")
-    with pytest.raises(InputError, match=r"box must have shape \(2, 3\)"):
-        stereo_points(left.image, right.image, pair, config=NEAR, box=torch.zeros(3))
+        tr.stereo_points(right.image, left.image, pair, config=NEAR)
 
 
-NEAR_BALL = StereoConfig(nearest=0.45, farthest=0.8)
+NOISE = torch.rand(2, 150, 200, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "options", "words"),
+    [
+        (NOISE[0], NOISE[1], {}, "left and right hardly match"),
+        (NOISE[0], NOISE[1, 1:], {}, r"right must have shape \(150, 200\)"),
+        (NOISE[0] / 0, NOISE[1], {}, "left must be finite"),
+        (
+            NOISE[0],
+            NOISE[1],
+            {"config": tr.StereoConfig(nearest=0.05)},
+            "nearest must keep disparities within the pict",
+        ),
+        (NOISE[0], NOISE[1], {"box": torch.zeros(3)}, r"box must have shape \(2, 3\)"),
+    ],
+)
+def test_bad_pictures_are_refused(scene, left, right, options, words):
+    with pytest.raises(InputError, match=words):
+        tr.stereo_points(left, right, scene[0], **{"config": NEAR, **options})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"nearest": 1.0, "farthest": 0.5}, "farthest must be beyond nearest"),
+        ({"method": "magic"}, "method must be one of semi-global, block, opencv; got 'magic'"),
+        ({"num_corners": 20, "least": 30}, "least must be at most num_corners"),
+    ],
+)
+def test_bad_settings_are_named(change, words):
+    with pytest.raises(InputError, match=words):
+        tr.StereoConfig(**change)
+
+
+NEAR_BALL = tr.StereoConfig(nearest=0.45, farthest=0.8)
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +179,7 @@ def pair():
 
 def ball_at(x, cameras):
     mesh = unit_sphere(3, dtype=torch.float64)
-    mesh = TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([x, 0.0, 0.6]), mesh.faces)
+    mesh = tr.TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([x, 0.0, 0.6]), mesh.faces)
     return [render(mesh, camera, style=PictureStyle(wall=0.9)).image for camera in cameras]
 
 
@@ -175,7 +196,7 @@ def folders(pair, tmp_path_factory):
 
 
 def test_frames_come_in_order_as_points_on_the_ball(folders, pair):
-    frames = StereoFrames(folders / "left", folders / "right", pair, config=NEAR_BALL)
+    frames = tr.StereoFrames(folders / "left", folders / "right", pair, config=NEAR_BALL)
     assert len(frames) == 2
     assert [name[-7:] for name in frames.names] == ["/f9.png", "f10.png"]
     clouds = frames[:]
@@ -193,12 +214,12 @@ def test_frames_come_in_order_as_points_on_the_ball(folders, pair):
 
 def test_pictures_of_a_turned_pair_are_rectified(pair, tmp_path):
     twist = torch.tensor([0.0, 0.002, 0.0, 0.01, -0.02, 0.01], dtype=torch.float64)
-    turned = Camera(160, 120, pair.right.intrinsics, se3_exp(twist) @ pair.right.world_to_camera)
-    crooked = StereoPair(pair.left, turned)
+    turned = tr.Camera(160, 120, pair.right.intrinsics, se3_exp(twist) @ pair.right.world_to_camera)
+    crooked = tr.StereoPair(pair.left, turned)
     for name, image in zip(("left", "right"), ball_at(0.0, (pair.left, turned)), strict=True):
         (tmp_path / name).mkdir()
         save_image(tmp_path / name / "0.png", image)
-    cloud = StereoFrames(tmp_path / "left", tmp_path / "right", crooked, config=NEAR_BALL)[0]
+    cloud = tr.StereoFrames(tmp_path / "left", tmp_path / "right", crooked, config=NEAR_BALL)[0]
     assert len(cloud) > 20
     assert ((cloud - torch.tensor([0.0, 0.0, 0.6])).norm(dim=-1) - 0.1).abs().median() < 3e-3
 
@@ -228,19 +249,19 @@ def test_what_comes_in_through_the_border_is_cut_off(pair):
 
 def test_errors_name_the_files(folders, pair, tmp_path):
     with pytest.raises(FormatError, match=r"right.f9.png and .*left.f9.png: left and right pictures are swapped"):
-        StereoFrames(folders / "right", folders / "left", pair, config=NEAR_BALL)[0]
+        tr.StereoFrames(folders / "right", folders / "left", pair, config=NEAR_BALL)[0]
     (tmp_path / "one").mkdir()
     with pytest.raises(FormatError, match="holds no pictures"):
-        StereoFrames(folders / "left", tmp_path / "one", pair)
+        tr.StereoFrames(folders / "left", tmp_path / "one", pair)
     save_image(tmp_path / "one" / "0.png", torch.zeros(120, 160))
     with pytest.raises(FormatError, match=r"equally many pictures, one per frame; got .*left 2, .*one 1"):
-        StereoFrames(folders / "left", tmp_path / "one", pair)
+        tr.StereoFrames(folders / "left", tmp_path / "one", pair)
     with pytest.raises(FormatError, match="hardly match"):
-        StereoFrames(tmp_path / "one", tmp_path / "one", pair, config=NEAR_BALL)[0]
+        tr.StereoFrames(tmp_path / "one", tmp_path / "one", pair, config=NEAR_BALL)[0]
     small = stereo_cameras(width=100, height=120, focal=190.0)
     with pytest.raises(FormatError, match=r"left must have shape \(120, 100, 3\)"):
-        StereoFrames(folders / "left", folders / "right", small, config=NEAR_BALL)[0]
+        tr.StereoFrames(folders / "left", folders / "right", small, config=NEAR_BALL)[0]
     with pytest.raises(FileNotFoundError, match="does not exist"):
-        StereoFrames(tmp_path / "none", tmp_path / "one", pair)
+        tr.StereoFrames(tmp_path / "none", tmp_path / "one", pair)
     with pytest.raises(InputError, match="reach must be positive"):
-        StereoFrames(folders / "left", folders / "right", pair, reach=0.0)
+        tr.StereoFrames(folders / "left", folders / "right", pair, reach=0.0)

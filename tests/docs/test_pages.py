@@ -71,19 +71,3 @@ def test_the_gallery_is_drawn_by_one_command(tmp_path, capsys):
     shown = set(re.findall(r"images/gallery/([\w.]+)", (DOCS / "gallery.md").read_text(encoding="utf-8")))
     assert drawn == shown
     assert shown <= {path.name for path in (DOCS / "images" / "gallery").iterdir()}
-
-
-def test_no_page_or_docstring_has_the_words_of_before():
-    page = (DOCS / "wordings.md").read_text(encoding="utf-8")
-    before = [
-        phrase
-        for row in re.findall(r"^\| ([^|`-][^|]*) \|", page, flags=re.MULTILINE)[1:]
-        for phrase in row.split("; ")
-    ]
-    long = [phrase for phrase in before if len(phrase.split()) > 3]
-    assert len(long) > 20
-    texts = [*PAGES, ROOT / "README.md", *(ROOT / "torchreg").rglob("*.py")]
-    for path in texts:
-        if path.name != "wordings.md":
-            text = " ".join(path.read_text(encoding="utf-8").lower().split())
-            assert [phrase for phrase in long if phrase in text] == [], path

@@ -15,13 +15,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def packed():
-    """What setup.py tells setuptools."""
-    told = {}
+    """The arguments that setup.py gives to setuptools."""
+    given = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
-        patch.setattr("setuptools.setup", lambda **settings: told.update(settings))
+        patch.setattr("setuptools.setup", lambda **settings: given.update(settings))
         runpy.run_path("setup.py")
-    return told
+    return given
 
 
 def test_every_package_and_configuration_is_packed_inside_the_library(packed):

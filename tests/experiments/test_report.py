@@ -1,35 +1,43 @@
+"""Reports of sweeps: what their page shows, the intervals in it, and the other places where records go."""
+
 import base64
 import json
 import re
+import shutil
+import sys
+import types
+from contextlib import contextmanager
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
+from PIL import Image
+from scipy import stats
 
 pytest.importorskip("plotly", reason="experiments take the extra experiments")
 
 from experiments.driver import run_sweep
-from experiments.errors import ConfigError, StoreError
+from experiments.errors import ConfigError, ExperimentError, StoreError
 from experiments.plan import planned_trials
 from experiments.records import TrialRecord, provenance
-from experiments.report import charts
+from experiments.report import browser, charts
 from experiments.report.cells import cells_of, marginal
 from experiments.report.charts import lines_over
+from experiments.report.intervals import confidence_interval
 from experiments.report.page import write_report
 from experiments.report.plots import save_plots
 from experiments.schema import ProbeTrial, ReportConfig
-
-PIXEL = base64.b64decode(
-    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR4nGNgYGBgAAAABQABpfZFQAAAAABJRU5ErkJggg=="
-)
+from experiments.sinks import SINKS, make_sink
 
 
 class Reader(HTMLParser):
     """Collects the tags of a page, its text outside scripts, and what it would load from elsewhere."""
 
-    def __init__(self):
+    def __init__(self, path):
         super().__init__()
         self.tags, self.text, self.loads, self._script = [], "", [], False
+        self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attributes):
         self.tags.append(tag)
@@ -43,34 +51,27 @@ class Reader(HTMLParser):
         self.text += "" if self._script else data
 
 
-def read(path):
-    reader = Reader()
-    reader.feed(path.read_text(encoding="utf-8"))
-    return reader
+@pytest.fixture
+def page(store):
+    """Return the function that writes the report of a sweep and returns its path."""
+    return lambda sweep, *notes: write_report(sweep, store, store.root / "report.html", *notes)
 
 
-def fill(store, sweep, value):
-    """Write a record per trial whose metric is a function of its configuration."""
-    store.prepare()
-    version = provenance()["versions"]["torchreg"]
-    for trial in planned_trials(sweep):
-        metrics = {"error_mm": value(trial.config), "failed": float(trial.config["seed"] == 0)}
-        curves = {"error_mm": [2.0 * metrics["error_mm"], metrics["error_mm"]]}
-        store.write(
-            TrialRecord(
-                trial.id,
-                sweep.task,
-                version,
-                trial.config,
-                trial.seed,
-                "done",
-                metrics,
-                {"run": 0.5},
-                curves,
-                started="2026-01-01T00:00:00+00:00",
-                **provenance(),
-            )
-        )
+@pytest.fixture
+def fill(store):
+    """Return the function that writes a record per trial whose metric is a function of its configuration."""
+
+    def fill(sweep, value=lambda config: 1.0):
+        store.prepare()
+        version, settings = provenance()["versions"]["torchreg"], {"started": "2026-01-01T00:00:00+00:00"}
+        for trial in planned_trials(sweep):
+            metrics = {"error_mm": value(trial.config), "failed": float(trial.config["seed"] == 0)}
+            outcome = metrics, {"run": 0.5}, {"error_mm": [2.0 * metrics["error_mm"], metrics["error_mm"]]}
+            identity = trial.id, sweep.task, version, trial.config, trial.seed, "done"
+            store.write(TrialRecord(*identity, *outcome, **settings, **provenance()))
+        return {record.id: record for record in store.records()[0]}
+
+    return fill
 
 
 @pytest.fixture
@@ -82,12 +83,10 @@ def grid(probe_sweep):
     return probe_sweep(grid={"scale": [1.0, 2.0, 4.0], "rounds": [1, 2]}, seeds=5, report=report)
 
 
-def test_cells_hold_medians_and_quartiles_over_seeds(store, grid):
-    fill(store, grid, lambda config: 10 * config["scale"] + config["seed"] ** 2)
-    cells = cells_of(grid, planned_trials(grid), {record.id: record for record in store.records()[0]})
-    assert [cell.axes for cell in cells][:3] == [
-        {"scale": 1.0, "rounds": 1}, {"scale": 1.0, "rounds": 2}, {"scale": 2.0, "rounds": 1},
-    ]  # fmt: skip
+def test_cells_hold_medians_and_quartiles_over_seeds(fill, grid):
+    cells = cells_of(grid, planned_trials(grid), fill(grid, lambda config: 10 * config["scale"] + config["seed"] ** 2))
+    axes = [(cell.axes["scale"], cell.axes["rounds"]) for cell in cells]
+    assert axes[:3] == [(1.0, 1), (1.0, 2), (2.0, 1)]
     spread = cells[0].metrics["error_mm"]
     # 10 and the squares of 0 to 4.
     assert (spread.count, spread.median, spread.low, spread.high, spread.mean) == (5, 14, 11, 19, 16)
@@ -95,142 +94,208 @@ def test_cells_hold_medians_and_quartiles_over_seeds(store, grid):
     assert marginal(cells, "scale", "error_mm", share=False) == {"1": 14, "2": 24, "4": 44}
 
 
-def test_plots_over_axes_of_numbers_are_one_picture(store, grid, tmp_path):
-    fill(store, grid, lambda config: config["scale"] + config["rounds"])
-    path = save_plots(grid, store, tmp_path / "plots.png")
-    assert path.stat().st_size > 5000
-    records = {record.id: record for record in store.records()[0]}
-    found = lines_over(grid, cells_of(grid, planned_trials(grid), records), "error_mm", "scale")
-    assert all(
-        low <= at <= high for line in found for low, at, high in zip(line.low, line.middle, line.high, strict=True)
-    )
-    assert all(line.middle == sorted(line.middle) for line in found)
+def test_plots_over_axes_of_numbers_are_one_picture(fill, store, grid, tmp_path):
+    records = fill(grid, lambda config: config["scale"] + config["rounds"])
+    assert save_plots(grid, store, tmp_path / "plots.png").stat().st_size > 5000
+    for line in lines_over(grid, cells_of(grid, planned_trials(grid), records), "error_mm", "scale"):
+        assert all(low <= at <= high for low, at, high in zip(line.low, line.middle, line.high, strict=True))
+        assert line.middle == sorted(line.middle)
 
 
-def test_the_page_is_one_file_that_shows_everything(store, grid):
-    fill(store, grid, lambda config: config["scale"] + config["rounds"])
-    reader = read(write_report(grid, store, store.root / "report.html"))
+def test_the_page_is_one_file_that_shows_everything(fill, page, grid):
+    fill(grid, lambda config: config["scale"] + config["rounds"])
+    reader, text = Reader(page(grid)), page(grid).read_text()
     assert all(value.startswith("data:") for value in reader.loads)
-    for text in (
-        "does it work?",
-        "30 trials: 30 done, 0 failed, 0 skipped",
-        "error, mm",
-        "5 / 5",
-        "Per axis",
-        "Convergence",
-    ):
-        assert text in reader.text
-    page = (store.root / "report.html").read_text()
-    assert page.count('class="plotly-graph-div"') == 4  # a heat map, a line plot per axis of numbers, and a curve
-    assert len(page) > 4_000_000  # Plotly itself lies in the page
-
-
-def test_best_values_are_marked_where_less_and_where_more_is_better(store, grid):
-    fill(store, grid, lambda config: config["scale"])
+    counts = "30 trials: 30 done, 0 failed, 0 skipped"
+    for words in ("does it work?", counts, "error, mm", "5 / 5", "Per axis", "Convergence"):
+        assert words in reader.text
+    assert text.count('class="plotly-graph-div"') == 4  # a heat map, a line plot per axis of numbers, and a curve
+    assert len(text) > 4_000_000  # Plotly itself lies in the page
+    # The best value is marked, whether less or more is better.
     for sweep, best in ((grid, "1"), (replace(grid, report=replace(grid.report, higher=("error_mm",))), "4")):
-        page = write_report(sweep, store, store.root / "report.html").read_text()
-        assert re.findall(r'<td class="best">([\d.]+)', page)[0] == best
+        fill(sweep, lambda config: config["scale"])
+        assert re.findall(r'<td class="best">([\d.]+)', page(sweep).read_text())[0] == best
 
 
-def test_failures_come_with_traceback_and_command(store, probe_sweep, inline_engine):
+def test_failures_come_with_traceback_and_command(store, page, probe_sweep, inline_engine):
     sweep = probe_sweep(grid={"outcome": ["done", "failed", "skipped"]})
     run_sweep(sweep, store, lambda: inline_engine)
-    text = read(write_report(sweep, store, store.root / "report.html")).text
+    text = Reader(page(sweep)).text
     assert "outcome failed, seed 0: ValueError: the probe was told to fail" in text
     assert "Traceback (most recent call last)" in text
     assert "python -m experiments rerun" in text
     assert "1 skipped: there is nothing to probe" in text
 
 
-def test_nothing_that_trials_tell_becomes_markup(store, probe_sweep, inline_engine):
+def test_nothing_in_a_trial_becomes_markup(store, page, probe_sweep, inline_engine):
     evil = "<img src=x onerror=alert(1)></script>"
-    sweep = probe_sweep(
-        cases=({"case": evil}, {"case": "fine", "scale": 2.0}), grid={}, report=ReportConfig(heat=()), seeds=2
-    )
-    sweep = replace(sweep, question=evil)
+    cases = ({"case": evil}, {"case": "fine", "scale": 2.0})
+    sweep = replace(probe_sweep(cases=cases, grid={}, report=ReportConfig(heat=()), seeds=2), question=evil)
     run_sweep(sweep, store, lambda: inline_engine)
     record = store.read(planned_trials(sweep)[0].id)
     store.write(replace(record, status="failed", note=evil, traceback=evil))
-    reader = read(write_report(sweep, store, store.root / "report.html"))
+    reader = Reader(page(sweep))
     assert "img" not in reader.tags
     assert reader.text.count(evil) >= 3
     # Inside scripts the charts' texts are escaped, so that none can end its script.
-    assert reader.tags.count("script") == (store.root / "report.html").read_text().count("</script>")
+    assert reader.tags.count("script") == page(sweep).read_text().count("</script>")
 
 
-def test_pictures_lie_in_the_page_and_models_are_linked(store, grid):
-    fill(store, grid, lambda config: 1.0)
+def test_pictures_lie_in_the_page_and_models_are_linked(fill, store, page, grid, tmp_path):
     trial = planned_trials(grid)[0]
-    record = store.read(trial.id)
+    record = fill(grid)[trial.id]
     store.write(replace(record, artifacts={"view": "a.png", "model": "b c.glb", "lost": "gone.png"}))
     folder = store.artifacts(trial.id)
     folder.mkdir(parents=True)
-    (folder / "a.png").write_bytes(PIXEL)
+    Image.new("RGB", (1, 1)).save(folder / "a.png")
     (folder / "b c.glb").write_bytes(b"glTF")
-    page = write_report(grid, store, store.root / "pages" / "report.html").read_text()
-    assert base64.b64encode(PIXEL).decode() in page
-    assert read(store.root / "pages" / "report.html").tags.count("img") == 1
-    assert f'href="../artifacts/{trial.id}/b%20c.glb"' in page
-    assert "view: scale 1, rounds 1, seed 0" in page
-
-
-def test_what_is_missing_or_foreign_is_told(store, grid, probe_sweep):
-    fill(store, grid, lambda config: 1.0)
-    for trial in planned_trials(grid)[:4]:
-        store.record_path(trial.id).unlink()
-    (store.trials / "0000000000000000.json").write_text("{")
-    fill(store, probe_sweep(trial=ProbeTrial(size=99)), lambda config: 9.0)
-    text = read(write_report(grid, store, store.root / "report.html", ["A note."])).text
-    assert "A note." in text
-    assert "4 trials have not run yet" in text
-    assert "3 records of other configurations" in text
-    assert "0000000000000000.json is not a record of a trial" in text
-
-
-def test_a_sweep_without_records_still_has_a_page(store, grid):
-    store.prepare()
-    assert "30 trials have not run yet" in read(write_report(grid, store, store.root / "report.html")).text
-
-
-def test_a_metric_that_no_record_has_is_named(store, grid):
-    fill(store, grid, lambda config: 1.0)
-    sweep = replace(grid, report=replace(grid.report, metrics=("eror_mm",)))
-    with pytest.raises(
-        ConfigError, match=r"unknown metric eror_mm in report; known metrics: error_mm, failed, seconds\.run"
-    ):
-        write_report(sweep, store, store.root / "report.html")
-
-
-def test_a_page_that_cannot_be_written_is_named(store, grid, tmp_path):
-    fill(store, grid, lambda config: 1.0)
+    path = write_report(grid, store, store.root / "pages" / "report.html")
+    assert base64.b64encode((folder / "a.png").read_bytes()).decode() in path.read_text()
+    assert Reader(path).tags.count("img") == 1
+    assert f'href="../artifacts/{trial.id}/b%20c.glb"' in path.read_text()
+    assert "view: scale 1, rounds 1, seed 0" in path.read_text()
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
         write_report(grid, store, tmp_path / "file" / "report.html")
 
 
-def test_curves_lie_at_their_steps_with_a_band_over_the_seeds(store, probe_sweep):
+def test_missing_and_foreign_records_are_named(fill, store, page, grid, probe_sweep):
+    fill(grid)
+    for trial in planned_trials(grid)[:4]:
+        store.record_path(trial.id).unlink()
+    (store.trials / "0000000000000000.json").write_text("{")
+    fill(probe_sweep(trial=ProbeTrial(size=99)), lambda config: float("nan"))
+    text = Reader(page(grid, ["A note."])).text
+    assert "A note." in text
+    assert "4 trials have not run yet" in text
+    assert "3 records of other configurations" in text
+    assert "0000000000000000.json is not a record of a trial" in text
+    message = r"unknown metric eror_mm in report; known metrics: error_mm, failed, seconds\.run"
+    with pytest.raises(ConfigError, match=message):
+        page(replace(grid, report=replace(grid.report, metrics=("eror_mm",))))
+
+
+def test_numbers_that_are_not_finite_leave_gaps(fill, store, page, probe_sweep):
+    sweep = probe_sweep(seeds=2)
+    store.prepare()
+    assert "6 trials have not run yet" in Reader(page(sweep)).text
+    fill(sweep, lambda config: float("nan"))
+    assert "NaN" not in re.sub(r"<script>.*?</script>", "", page(sweep).read_text(), count=1, flags=re.DOTALL)
+    assert json.loads(next(iter(store.trials.glob("*.json"))).read_text())["metrics"]["error_mm"] is None
+
+
+def test_curves_lie_at_their_steps_with_a_band_over_the_seeds(fill, probe_sweep):
     report = ReportConfig(curves=("error_mm",), curve_steps="steps", curve_spread=True)
     sweep = probe_sweep(grid={"scale": [1.0]}, seeds=3, report=report)
-    fill(store, sweep, lambda config: 1.0 + config["seed"])
-    found = {one.id: replace(one, curves=one.curves | {"steps": [0.0, 50.0]}) for one in store.records()[0]}
-    chart = charts.curves(sweep, planned_trials(sweep), found, "error_mm")
+    records = fill(sweep, lambda config: 1.0 + config["seed"])
+    found = {name: replace(one, curves=one.curves | {"steps": [0.0, 50.0]}) for name, one in records.items()}
+
+    def chart(**settings):
+        changed = replace(sweep, report=replace(report, **settings))
+        return charts.curves(changed, planned_trials(changed), found, "error_mm")
+
     # Errors end at 1, 2 and 3, and begin at their doubles.
-    assert '"x":[0.0,50.0],"y":[4.0,2.0]' in chart
-    assert '"x":[0.0,50.0,50.0,0.0],"y":[6.0,3.0,1.0,2.0]' in chart
-    assert "mean, lowest and highest over all trials" in chart
-    assert '"type":"log"' not in chart
-    steep = replace(sweep, report=replace(report, curve_log=True))
-    assert '"type":"log"' in charts.curves(steep, planned_trials(steep), found, "error_mm")
+    assert '"x":[0.0,50.0],"y":[4.0,2.0]' in chart()
+    assert '"x":[0.0,50.0,50.0,0.0],"y":[6.0,3.0,1.0,2.0]' in chart()
+    assert "mean, lowest and highest over all trials" in chart()
+    assert ('"type":"log"' in chart(), '"type":"log"' in chart(curve_log=True)) == (False, True)
     assert charts.curve_names(replace(sweep, report=replace(report, curves=())), found) == ["error_mm"]
-    plain = replace(sweep, report=replace(report, curve_steps="", curve_spread=False))
-    chart = charts.curves(plain, planned_trials(plain), found, "error_mm")
-    assert '"x":[1.0,2.0],"y":[4.0,2.0]' in chart
-    assert chart.count('"type":"scatter","x"') + chart.count('"y":[') <= 2
+    plain = chart(curve_steps="", curve_spread=False)
+    assert '"x":[1.0,2.0],"y":[4.0,2.0]' in plain
+    assert plain.count('"type":"scatter","x"') + plain.count('"y":[') <= 2
 
 
-def test_numbers_that_are_not_finite_leave_gaps(store, probe_sweep):
-    sweep = probe_sweep(seeds=2)
-    fill(store, sweep, lambda config: float("nan"))
-    page = write_report(sweep, store, store.root / "report.html").read_text()
-    assert "NaN" not in re.sub(r"<script>.*?</script>", "", page, count=1, flags=re.DOTALL)
-    assert json.loads(next(iter(store.trials.glob("*.json"))).read_text())["metrics"]["error_mm"] is None
+def test_shares_have_the_interval_of_a_score_test():
+    for count, total in ((0, 10), (3, 12), (12, 12)):
+        values = [1.0] * count + [0.0] * (total - count)
+        expected = stats.binomtest(count, total).proportion_ci(method="wilson")
+        assert confidence_interval(values, mean=True) == pytest.approx((expected.low, expected.high), abs=1e-6)
+
+
+def test_intervals_of_means_and_medians_are_those_in_theory():
+    values = np.random.default_rng(1).normal(3.0, 2.0, 400)
+    half = 1.96 * values.std() / 20
+    expected = (values.mean() - half, values.mean() + half)
+    assert confidence_interval(values.tolist(), mean=True) == pytest.approx(expected, abs=0.03)
+    random = np.random.default_rng(2)
+    found = [confidence_interval(random.exponential(1.0, 25).tolist(), mean=False) for _ in range(200)]
+    assert 0.88 < np.mean([low <= np.log(2) <= high for low, high in found]) <= 1.0
+    assert confidence_interval([1.0], mean=False) is None
+    assert confidence_interval([2.0, 2.0], mean=False) == (2.0, 2.0)
+
+
+@pytest.mark.parametrize("name", SINKS)
+def test_a_sink_whose_package_is_missing_says_so(name, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard" if name == "tensorboard" else name, None)
+    with pytest.raises(ExperimentError, match=f"--sink {name} needs the package .*, which is not installed"):
+        make_sink(name, "sweep", str(tmp_path))
+
+
+def fake_package(name, calls):
+    """Return the name of the module that a sink uses, and one whose functions only note their arguments."""
+
+    note = calls.append
+
+    @contextmanager
+    def start_run(run_name):
+        calls.append(run_name)
+        yield
+
+    def init(**settings):
+        calls.append(settings["name"])
+        return types.SimpleNamespace(log=calls.append, finish=lambda exit_code: calls.append(exit_code))
+
+    @contextmanager
+    def writer(folder):
+        calls.append(folder.rpartition("/")[2])
+        yield types.SimpleNamespace(
+            add_scalar=lambda *row: calls.append(row),
+            add_hparams=lambda settings, numbers, run_name: calls.append(numbers),
+        )
+
+    notes = dict.fromkeys(("set_experiment", "log_params", "log_metrics", "set_tags"), note)
+    functions = {
+        "mlflow": {**notes, "start_run": start_run}, "wandb": {"init": init}, "tensorboard": {"SummaryWriter": writer},
+    }  # fmt: skip
+    return types.SimpleNamespace(**functions[name])
+
+
+@pytest.mark.parametrize("name", ["mlflow", "wandb", "tensorboard"])
+def test_a_sink_receives_every_record(name, monkeypatch, store, probe_sweep, inline_engine):
+    calls = []
+    module = "torch.utils.tensorboard" if name == "tensorboard" else name
+    monkeypatch.setitem(sys.modules, module, fake_package(name, calls))
+    run_sweep(probe_sweep(), store, lambda: inline_engine, sinks=[make_sink(name, "probes", str(store.root))])
+    records, _ = store.records()
+    assert {record.id for record in records} <= {one for one in calls if isinstance(one, str)}
+    values = [one["value"] for one in calls if isinstance(one, dict) and "value" in one]
+    assert sorted(values) == sorted(record.metrics["value"] for record in records)
+
+
+@pytest.fixture
+def chromium():
+    pytest.importorskip("selenium")
+    if shutil.which("chromedriver") is None:
+        pytest.skip("there is no Chromium here: apt-get install chromium chromium-driver")
+
+
+def test_a_report_opens_without_a_network_and_without_complaints(chromium, fill, page, grid, tmp_path):
+    fill(grid, lambda config: config["scale"] + config["rounds"])
+    assert browser.photograph(page(grid), tmp_path / "page.png") == []
+    with Image.open(tmp_path / "page.png") as picture:
+        assert picture.width > 1000
+        # The heat map is drawn: much of the picture is neither white nor gray.
+        red, _, blue = picture.convert("RGB").resize((100, 100)).split()
+        pairs = zip(red.tobytes(), blue.tobytes(), strict=True)
+        assert sum(abs(one - other) > 60 for one, other in pairs) > 200
+    bad = tmp_path / "bad.html"
+    bad.write_text("<html><head><link rel='icon' href='data:,'></head><script>undefined_name()</script></html>")
+    (complaint,) = browser.photograph(bad, tmp_path / "bad.png")
+    assert "undefined_name is not defined" in complaint
+
+
+def test_without_chromium_it_says_what_to_install(monkeypatch, tmp_path):
+    pytest.importorskip("selenium")
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ExperimentError, match="apt-get install chromium chromium-driver"):
+        browser.photograph(tmp_path / "a.html", tmp_path / "a.png")

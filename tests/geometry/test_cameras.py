@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.camera import Camera, check_rigid_motion, lens_jacobian
+from torchreg.errors import InputError
+from torchreg.geometry.camera import Camera, lens_jacobian
 from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix, se3_exp, transform_points
@@ -32,24 +32,6 @@ def points_before(camera, count=50, seed=0):
     local = torch.rand(count, 3, generator=generator, dtype=torch.float64) * 2 - 1
     local = local * torch.tensor([0.5, 0.4, 0.5]) + torch.tensor([0.0, 0.0, 1.5])
     return transform_points(camera.camera_to_world.double(), local)
-
-
-@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_projection_agrees_with_opencv(lens):
-    cv2 = pytest.importorskip("cv2")
-    camera = make(lens)
-    points = points_before(camera)
-    rotation, _ = cv2.Rodrigues(camera.world_to_camera[:3, :3].numpy())
-    expected, _ = cv2.projectPoints(
-        points.numpy(),
-        rotation,
-        camera.world_to_camera[:3, 3].numpy(),
-        camera.matrix.numpy(),
-        camera.distortion.numpy(),
-    )
-    pixels, depth = camera.project(points)
-    assert (pixels - torch.from_numpy(expected[:, 0])).abs().max() < 1e-6
-    assert torch.allclose(depth, transform_points(camera.world_to_camera, points)[:, 2])
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
@@ -143,8 +125,6 @@ def test_scaled_and_moved_cameras_see_the_same():
     assert torch.allclose((half + 0.5) * 2 - 0.5, pixels)
     motion = se3_exp(torch.tensor([0.3, 0.1, -0.2, 0.5, 0.2, 0.1], dtype=torch.float64))
     assert torch.allclose(camera.moved(motion).project(transform_points(motion, points))[0], pixels)
-    with pytest.raises(InputError, match="must leave a pixel"):
-        camera.scaled(1e-4)
 
 
 def test_view_rasterizes_what_project_says():
@@ -157,35 +137,6 @@ def test_view_rasterizes_what_project_says():
     pixels, depth = camera.project(points)
     assert torch.allclose(pixels, camera.pixel_grid()[seen], atol=1e-9)
     assert torch.allclose(depth, raster.depth[seen])
-    with pytest.raises(InputError, match="square pixels and no distortion"):
-        make(LENSES["four"]).view()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"width": 0}, "width must be at least 1"),
-        ({"width": 10_000, "height": 10_000}, "at most 64 megapixels"),
-        ({"intrinsics": (1.0, 1.0, 1.0)}, r"intrinsics must have shape \(4\)"),
-        ({"intrinsics": (1.0, -1.0, 1.0, 1.0)}, r"intrinsics \(fy\) must be positive"),
-        ({"intrinsics": (1.0, math.nan, 1.0, 1.0)}, "must be finite"),
-        ({"intrinsics": ("a", 1.0, 1.0, 1.0)}, "must hold numbers"),
-        ({"distortion": (0.1,)}, "0, 4, 5 or 8 numbers"),
-        ({"world_to_camera": 2 * torch.eye(4)}, "must be a rotation and a translation"),
-        ({"world_to_camera": torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))}, "must be a rotation and a translation"),
-        ({"world_to_camera": torch.eye(3)}, r"world_to_camera must have shape \(4, 4\)"),
-    ],
-)
-def test_what_is_no_camera_is_refused(change, message):
-    values = {"width": 4, "height": 4, "intrinsics": (2.0, 2.0, 1.5, 1.5)} | change
-    with pytest.raises(InputError, match=message):
-        Camera(**values)
-
-
-def test_rigid_motions_may_be_rounded():
-    check_rigid_motion(se3_exp(torch.ones(6)), "motion")
-    with pytest.raises(InputError, match="motion must be a rotation"):
-        check_rigid_motion(torch.eye(4) * 1.01, "motion")
 
 
 INTRINSICS = (600.0, 600.0, 319.5, 239.5)
@@ -243,28 +194,9 @@ def test_other_pairs_are_not_rectified(right):
         pair.check_rectified()
 
 
-def test_swapped_and_senseless_pairs_are_refused():
-    with pytest.raises(InputError, match=r"swapped: the right camera stands 0\.12 to the left"):
-        StereoPair(camera_at(0.06), camera_at(-0.06))
-    with pytest.raises(InputError, match="different places"):
-        StereoPair(camera_at(0.0), camera_at(0.0))
-    with pytest.raises(InputError, match="look the same way"):
-        StereoPair(camera_at(0.0), camera_at(0.1, turn=(0.0, 2.0, 0.0)))
-
-
 def test_rig_finds_cameras_by_name_and_place():
     rig = CameraRig((camera_at(0.0, name="left"), camera_at(0.1)))
     assert rig.names == ("left", "camera1")
     assert rig["left"] is rig[0]
     assert len(rig) == len(list(rig)) == 2
     assert rig.stereo().baseline == pytest.approx(0.1)
-    with pytest.raises(InputError, match="no camera 'top', it has left, camera1"):
-        rig["top"]
-    with pytest.raises(InputError, match="two cameras"):
-        CameraRig((rig[0],)).stereo()
-    with pytest.raises(InputError, match="left more than once"):
-        CameraRig((rig[0], rig[0]))
-    with pytest.raises(InputError, match="at least one"):
-        CameraRig(())
-    with pytest.raises(InputTypeError, match="Camera records"):
-        CameraRig((1,))

@@ -9,9 +9,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from torch.func import jacfwd, jacrev
 
-from torchreg.geometry.rigid import adjoint, fit_rigid, invert_rigid, rigid_matrix, se3_exp, se3_log, transform_points
+from torchreg.geometry.rigid import adjoint, fit_rigid, invert_rigid, se3_exp, se3_log, transform_points
 from torchreg.geometry.rigid_moments import least_cost, rigid_moments
-from torchreg.geometry.rotation import so3_exp
 
 # torch's own forward mode compiles its decompositions with a deprecated call on first use.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
@@ -25,15 +24,6 @@ def random_twists(count, seed=0):
 
 def random_points(*shape, seed=0):
     return torch.randn(*shape, 3, generator=torch.Generator().manual_seed(seed), dtype=D)
-
-
-def test_a_rigid_matrix_holds_its_parts():
-    rotation, translation = so3_exp(torch.tensor([0.1, 0.2, 0.3], dtype=D)), torch.tensor([1.0, 2.0, 3.0], dtype=D)
-    matrix = rigid_matrix(rotation, translation)
-    assert torch.equal(matrix[:3, :3], rotation)
-    assert torch.equal(matrix[:3, 3], translation)
-    assert matrix[3].tolist() == [0, 0, 0, 1]
-    assert rigid_matrix(rotation.float(), translation.float()).dtype == torch.float32
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 5e-3, 0.011, 1.0, math.pi, 5.0])
@@ -58,12 +48,6 @@ def test_se3_exp_differentiates_at_zero_in_every_mode():
         assert torch.autograd.gradcheck(se3_exp, twist.clone().requires_grad_(), check_forward_ad=True)
 
 
-def test_the_inverse_undoes():
-    matrices = se3_exp(random_twists(7))
-    torch.testing.assert_close(invert_rigid(matrices) @ matrices, torch.eye(4, dtype=D).expand(7, 4, 4))
-    torch.testing.assert_close(invert_rigid(matrices), torch.linalg.inv(matrices))
-
-
 def test_transforming_points_is_homogeneous_multiplication():
     matrices, points = se3_exp(random_twists(2)), random_points(2, 5)
     homogeneous = torch.cat([points, torch.ones(2, 5, 1, dtype=D)], dim=-1)
@@ -71,13 +55,6 @@ def test_transforming_points_is_homogeneous_multiplication():
     torch.testing.assert_close(transform_points(matrices, points), expected)
     torch.testing.assert_close(transform_points(matrices, points[0])[1], transform_points(matrices[1], points[0]))
     torch.testing.assert_close(transform_points(invert_rigid(matrices), transform_points(matrices, points)), points)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_fit_recovers_a_motion(dtype):
-    matrices, points = se3_exp(random_twists(4)).to(dtype), random_points(4, 9).to(dtype)
-    fitted = fit_rigid(points, transform_points(matrices, points))
-    torch.testing.assert_close(fitted, matrices, atol=1e-5 if dtype == torch.float32 else 1e-12, rtol=0)
 
 
 def test_fit_agrees_with_scipy_under_noise_and_weights():
@@ -89,12 +66,6 @@ def test_fit_agrees_with_scipy_under_noise_and_weights():
     fitted = fit_rigid(source, target, weights)
     np.testing.assert_allclose(fitted[:3, :3], expected.as_matrix(), atol=1e-10)
     torch.testing.assert_close(transform_points(fitted, centers[0][None])[0], centers[1])
-
-
-def test_fit_never_reflects():
-    source = random_points(30)
-    mirrored = source * torch.tensor([1.0, 1.0, -1.0], dtype=D)
-    assert torch.det(fit_rigid(source, mirrored)[:3, :3]) == pytest.approx(1.0)
 
 
 def test_fit_of_points_in_a_plane_and_of_one_point_stays_rigid():

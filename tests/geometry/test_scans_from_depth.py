@@ -3,10 +3,8 @@
 import pytest
 import torch
 
-from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.depth_image import unproject
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.range_scan import RangeScan
 
 PINHOLE = (100.0, 90.0, 20.0, 15.0)
 
@@ -47,11 +45,6 @@ def test_slanted_planes_hold_together_and_steps_do_not(slope):
     assert not bool(((columns < 24.5).any(-1) & (columns > 24.5).any(-1)).any())
 
 
-def test_a_crease_is_no_jump():
-    depth = torch.maximum(plane_depth((2.0, 0.0, 1.0), 10.0), plane_depth((-2.0, 0.0, 1.0), 10.0))
-    assert len(unproject(depth, PINHOLE, 3.0)[1]) == 2 * 30 * 40
-
-
 def test_what_flies_between_two_surfaces_is_left_out():
     depth = torch.full((20, 20), 1.0).double()
     depth[:, 10:] = 3.0
@@ -59,12 +52,6 @@ def test_what_flies_between_two_surfaces_is_left_out():
     points, faces = unproject(depth, (100, 100, 10, 10), 3.0)
     assert set(points[:, 2].tolist()) == {1.0, 3.0}
     assert len(faces) == 2 * 19 * (9 + 8)
-
-
-def test_noise_does_not_tear():
-    noise = torch.randn(31, 41, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    faces = unproject(plane_depth((0.0, 0.0, 1.0), 1.0) + 0.05 * noise, PINHOLE, 3.0)[1]
-    assert len(faces) > 0.99 * 2 * 30 * 40
 
 
 def test_holes_leave_out_their_pixels_and_corners_keep_their_triangle():
@@ -94,20 +81,3 @@ def test_units_do_not_matter():
         scaled, same = unproject(depth * scale, PINHOLE, 3.0)
         assert torch.equal(same, faces)
         torch.testing.assert_close(scaled, points * scale)
-
-
-@pytest.mark.parametrize(
-    ("depth", "intrinsics", "error", "message"),
-    [
-        (torch.ones(3), PINHOLE, InputError, r"depth must have shape \(H, W\)"),
-        (torch.zeros(3, 3), PINHOLE, InputError, "0 of 9 pixels measured and none joined"),
-        (torch.ones(1, 9), PINHOLE, InputError, "9 of 9 pixels measured and none joined"),
-        (torch.ones(3, 3), (1, 1, 1), InputTypeError, "intrinsics must be the four numbers fx, fy, cx, cy"),
-        (torch.ones(3, 3), (0.0, 1, 1, 1), InputError, r"intrinsics\[0\] \(fx\) must be positive"),
-        (torch.ones(3, 3), (1, -1, 1, 1), InputError, r"intrinsics\[1\] \(fy\) must be positive"),
-        (torch.ones(3, 3), (1, 1, float("nan"), 1), InputError, "intrinsics must be finite"),
-    ],
-)
-def test_what_is_no_depth_image(depth, intrinsics, error, message):
-    with pytest.raises(error, match=message):
-        RangeScan.from_depth(depth, intrinsics)

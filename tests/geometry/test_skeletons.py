@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import rigid_matrix, se3_exp
 from torchreg.geometry.skeleton import Skeleton, build_skeleton, nearest_rotation, resample_curve
 
@@ -54,12 +53,6 @@ def test_tips_junctions_and_limbs_of_a_tree_drawn_by_hand():
     assert float(tree.length) == pytest.approx(sum(math.dist(tree.nodes[a], tree.nodes[b]) for a, b in EDGES))
 
 
-def test_a_tree_without_junctions_is_one_limb():
-    line = figure([(2, 0), (0, 1)])
-    assert [limb.tolist() for limb in line.limbs] == [[1, 0, 2]]
-    assert line.topology == "(())"
-
-
 def test_a_single_node_is_a_tip_without_a_limb():
     point = Skeleton(torch.zeros(1, 3), [], torch.ones(1))
     assert point.tips.tolist() == [0]
@@ -67,17 +60,6 @@ def test_a_single_node_is_a_tip_without_a_limb():
     assert point.topology == "()"
     assert point.limb_lengths.shape == (0,)
     assert point.limb_ends.shape == (0, 2)
-    with pytest.raises(InputError, match="single node"):
-        point.resample(3)
-
-
-def test_topology_of_stars_counts_arms_and_ignores_nodes_in_between():
-    assert star(5, 1).topology == star(5, 4).topology == "(()()()()())"
-    assert star(4, 2).topology != star(5, 2).topology
-    # Three junctions of degree three also have five tips.
-    split = figure([(0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (5, 6), (5, 7)])
-    assert len(split.tips) == 5
-    assert split.topology != star(5, 1).topology
 
 
 @settings(max_examples=60, deadline=None)
@@ -98,8 +80,6 @@ def test_path_runs_along_the_tree():
     tree = figure()
     assert tree.path(0, 6).tolist() == [0, 1, 2, 4, 5, 6]
     assert tree.path(3, 3).tolist() == [3]
-    with pytest.raises(InputError, match="end must be a node from 0 to 7, got 8"):
-        tree.path(0, 8)
 
 
 def test_resampled_curves_have_equal_steps_and_keep_their_ends():
@@ -127,11 +107,6 @@ def test_resampling_is_differentiable_in_points_and_radii():
 
     assert torch.autograd.gradcheck(moved, torch.ones((), dtype=torch.float64, requires_grad=True))
     assert torch.autograd.gradcheck(lambda r: resample_curve(held, r, eye, 6)[1], radii)
-
-
-def test_a_polyline_that_stands_still_is_resampled_in_place():
-    points, _, _ = resample_curve(torch.ones(3, 3), torch.ones(3), torch.eye(3).expand(3, 3, 3), 4)
-    assert torch.equal(points, torch.ones(4, 3))
 
 
 def test_nearest_rotation_is_right_handed_also_from_a_mirror():
@@ -164,48 +139,6 @@ def test_limbs_that_share_end_numbers_are_joined():
     assert len(built) == 11
     assert built.notes == ("a note",)
     assert torch.equal(built.nodes[built.limbs[3]], limbs[3][0])
-    with pytest.raises(InputError, match="one tree"):
-        build_skeleton([*limbs[:1], limbs[0]], [(0, 1), (1, 0)])
-
-
-@pytest.mark.parametrize(
-    ("edges", "message"),
-    [
-        ([(0, 1), (1, 2), (2, 0)], "one tree"),
-        ([(0, 1)], "one tree"),
-        ([(0, 1), (1, 0)], "reach 2 of 3 nodes"),
-        ([(0, 1), (1, 3)], "must index the 3 nodes"),
-        ([(0, 1, 2)], "shape"),
-    ],
-)
-def test_edges_that_are_no_tree_are_refused(edges, message):
-    with pytest.raises(InputError, match=message):
-        Skeleton(torch.zeros(3, 3), edges, torch.ones(3))
-
-
-def test_wrong_values_are_refused():
-    edges = [(0, 1)]
-    with pytest.raises(InputTypeError, match="edges must hold integers"):
-        Skeleton(torch.zeros(2, 3), torch.zeros(1, 2), torch.ones(2))
-    with pytest.raises(InputError, match="nodes must be finite"):
-        Skeleton(torch.tensor([[0.0, 0, math.nan], [0, 0, 0]]), edges, torch.ones(2))
-    with pytest.raises(InputError, match="radii must have shape"):
-        Skeleton(torch.zeros(2, 3), edges, torch.ones(3))
-    with pytest.raises(InputError, match="frames must be rotations"):
-        Skeleton(torch.zeros(2, 3), edges, torch.ones(2), -torch.eye(3).expand(2, 3, 3))
-    with pytest.raises(InputError, match="confidence must have shape"):
-        Skeleton(torch.zeros(2, 3), edges, torch.ones(2), confidence=torch.ones(3))
-    with pytest.raises(InputError, match="count must be at least 2"):
-        figure().resample(1)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_everything_takes_the_dtype_of_the_nodes(dtype):
-    tree = Skeleton(random(8, 3).to(dtype), torch.tensor(EDGES, dtype=torch.int32), [1.0] * 8, confidence=[0.5] * 4)
-    assert tree.edges.dtype == torch.int64
-    assert {value.dtype for value in (tree.radii, tree.frames, tree.confidence, tree.length, *tree.resample(3))} == {
-        dtype
-    }
 
 
 def test_points_belong_to_the_limb_whose_surface_is_nearest():
@@ -217,5 +150,3 @@ def test_points_belong_to_the_limb_whose_surface_is_nearest():
     assert [int(skeleton.limbs[limb][0]) for limb in found] == [2, 6, 4, 7]
     moved = skeleton.transformed(se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.3, -1.0, 0.4])))
     assert torch.equal(moved.limb_of(moved.nodes[1:]), skeleton.limb_of(nodes[1:]))
-    with pytest.raises(InputError, match="must have a limb"):
-        Skeleton(nodes[:1], torch.zeros(0, 2, dtype=torch.int64), torch.ones(1)).limb_of(nodes)

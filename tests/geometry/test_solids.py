@@ -102,61 +102,15 @@ def test_the_ellipsoid_distance_is_euclidean_to_first_order(radii):
     assert errors[0] < 0.1 * 1e-3
 
 
-def test_a_sphere_is_exact_everywhere():
-    points = random_points(100, (1.0,), spread=3)
-    torch.testing.assert_close(
-        PRIMITIVE_KINDS["ellipsoid"].distance(points, row((1.0, 1.0, 1.0))), points.norm(dim=-1) - 1
-    )
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.floats(0.01, 0.1), st.floats(0.01, 0.1), st.floats(0.01, 0.1), st.floats(0, math.pi), st.floats(0, 6.28))
-def test_the_zero_set_is_the_ellipsoid_with_unit_gradient(a, b, c, polar, azimuth):
-    direction = [math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)]
-    point = row(direction) * row((a, b, c))
-    distance, gradient = PRIMITIVE_KINDS["ellipsoid"].gradient(point, row((a, b, c)))
-    assert abs(float(distance)) < 1e-15
-    assert float(gradient.norm()) == pytest.approx(1, abs=1e-10)
-
-
 # --- capsules and cones ---
 
 
-@pytest.mark.parametrize("sizes", SIZES["capsule"])
-def test_the_capsule_distance_is_exact(sizes):
-    points = random_points(400, sizes, spread=2.5)
-    expected = profile_distance(points.numpy(), capsule_outline(*sizes))
-    np.testing.assert_allclose(
-        PRIMITIVE_KINDS["capsule"].distance(points, row(sizes)), expected, atol=1e-6 * max(sizes)
-    )
-
-
-@pytest.mark.parametrize("sizes", SIZES["cone"])
-def test_the_cone_distance_is_exact(sizes):
-    points = random_points(2000, sizes, spread=2.5)
-    expected = profile_distance(points.numpy(), cone_outline(*sizes))
-    np.testing.assert_allclose(PRIMITIVE_KINDS["cone"].distance(points, row(sizes)), expected, atol=1e-15)
-
-
-@pytest.mark.parametrize(("kind", "sizes"), [("cone", SIZES["cone"][0]), ("capsule", SIZES["capsule"][0])])
-def test_distances_agree_with_a_densely_sampled_surface(kind, sizes):
-    outline = cone_outline(*sizes) if kind == "cone" else capsule_outline(*sizes, count=20)
-    steps = np.linspace(0, 1, 120)[:, None, None]
-    profile = (outline[:-1] * (1 - steps) + outline[1:] * steps).reshape(-1, 2)
-    turns, radius, height = np.linspace(0, 2 * np.pi, 150), profile[:, :1], profile[:, 1:]
-    surface = np.stack(np.broadcast_arrays(radius * np.cos(turns), radius * np.sin(turns), height), -1).reshape(-1, 3)
-    points = random_points(50, sizes, seed=1, spread=2)
-    nearest = torch.cdist(points, torch.from_numpy(surface)).amin(-1)
-    distance = PRIMITIVE_KINDS[kind].distance(points, row(sizes))
-    torch.testing.assert_close(distance.abs(), nearest, atol=5e-4, rtol=0)
-
-
-@pytest.mark.parametrize("kind", ["capsule", "cone"])
-def test_exact_distances_have_unit_gradients(kind):
-    for sizes in SIZES[kind]:
-        points = random_points(300, sizes, seed=2, spread=2.5)
-        gradient = PRIMITIVE_KINDS[kind].gradient(points, row(sizes))[1]
-        torch.testing.assert_close(gradient.norm(dim=-1), torch.ones(300, dtype=D))
+@pytest.mark.parametrize(("kind", "sizes"), [case for case in CASES if case[0] in ("capsule", "cone")])
+def test_distances_to_capsules_and_cones_are_exact(kind, sizes):
+    points = random_points(2000 if kind == "cone" else 400, sizes, spread=2.5)
+    outline, tolerance = (cone_outline, 1e-15) if kind == "cone" else (capsule_outline, 1e-6 * max(sizes))
+    expected = profile_distance(points.numpy(), outline(*sizes))
+    np.testing.assert_allclose(PRIMITIVE_KINDS[kind].distance(points, row(sizes)), expected, atol=tolerance)
 
 
 def test_the_rim_of_a_cone_is_finite():
@@ -195,28 +149,6 @@ def test_superquadrics_pass_through_their_parametrization_and_are_radial(sizes):
         torch.testing.assert_close(distance, (factor - 1) * surface.norm(dim=-1), atol=1e-9, rtol=1e-9)
 
 
-def test_a_superquadric_of_exponents_one_is_an_ellipsoid_to_the_sign():
-    points = random_points(200, (0.05,))
-    radii = (0.02, 0.03, 0.05)
-    expected = (points / row(radii)).norm(dim=-1) - 1
-    assert torch.equal(
-        PRIMITIVE_KINDS["superquadric"].distance(points, row((*radii, 1.0, 1.0))).sign(), expected.sign()
-    )
-
-
-@pytest.mark.parametrize("sizes", SIZES["superquadric"])
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_superquadrics_are_finite_on_axes_and_planes(sizes, dtype):
-    grid = torch.tensor([-0.03, 0.0, 0.02], dtype=dtype)
-    points = torch.cartesian_prod(grid, grid, grid).requires_grad_()
-    distance, gradient = PRIMITIVE_KINDS["superquadric"].gradient(points, row(sizes, dtype))
-    assert torch.isfinite(distance).all()
-    assert torch.isfinite(gradient).all()
-    learned = row(sizes, dtype).requires_grad_()
-    grads = torch.autograd.grad(PRIMITIVE_KINDS["superquadric"].distance(points, learned).sum(), (points, learned))
-    assert all(torch.isfinite(grad).all() for grad in grads)
-
-
 # --- every kind ---
 
 
@@ -230,14 +162,6 @@ def test_analytic_gradients_are_those_of_autograd(kind, sizes):
     torch.testing.assert_close(gradient, auto, atol=1e-10, rtol=1e-9)
     forward = vmap(jacfwd(lambda p: PRIMITIVE_KINDS[kind].distance(p, row(sizes))))(points.detach())
     torch.testing.assert_close(forward, auto, atol=1e-10, rtol=1e-9)
-
-
-@pytest.mark.parametrize(("kind", "sizes"), CASES)
-def test_gradients_are_those_of_finite_differences_in_points_and_sizes(kind, sizes):
-    # Away from the box-like exponents' creases, where the second derivative is too large to difference.
-    sizes = tuple(max(0.5, min(s, 1.5)) if i > 2 else s for i, s in enumerate(sizes))
-    points, learned = random_points(20, sizes, seed=4).requires_grad_(), row(sizes).requires_grad_()
-    assert torch.autograd.gradcheck(PRIMITIVE_KINDS[kind].distance, (points, learned), eps=1e-8, atol=1e-5)
 
 
 @pytest.mark.parametrize(("kind", "sizes"), CASES)
@@ -290,13 +214,6 @@ def test_lengths_scale(kind, sizes):
     torch.testing.assert_close(
         record.distance(points * 1000, scaled), 1000 * record.distance(points, row(sizes)), rtol=1e-9, atol=1e-12
     )
-
-
-def test_kinds_describe_their_sizes():
-    for name, kind in PRIMITIVE_KINDS.items():
-        assert kind.name == name
-        assert len(kind.sizes) == len(SIZES[name][0])
-        assert any(size.is_long for size in kind.sizes)
 
 
 def directions(count, seed=0):
@@ -371,25 +288,11 @@ def test_sizes_come_back():
     np.testing.assert_allclose(sorted([bottom, top]), [0.008, 0.02], rtol=0.1)
 
 
-def test_a_cut_ellipsoid_is_completed():
-    points = CLOUDS["ellipsoid"]
-    points = points[points[:, 2] > -0.025]
-    fit = fit_primitive(moved(points), "ellipsoid")
-    assert max(fit.sizes) == pytest.approx(0.04, rel=0.1)
-    assert fit.error < 5e-4
-
-
 @pytest.mark.parametrize("kind", list(CLOUDS))
 def test_auto_is_at_least_as_near_as_every_kind(kind):
     points = moved(CLOUDS[kind])
     fit = fit_primitive(points)
     assert fit.error == min(fit_primitive(points, name).error for name in PRIMITIVE_KINDS)
-
-
-def test_auto_tells_the_kinds_apart():
-    assert {kind: fit_primitive(moved(points)).kind for kind, points in CLOUDS.items()} == {
-        kind: kind for kind in CLOUDS
-    }
 
 
 @settings(max_examples=15, deadline=None)
@@ -422,10 +325,3 @@ def test_clouds_without_volume_give_thin_solids(points, kind):
     flat = np.linalg.matrix_rank((points - points[0]).numpy(), tol=1e-5) < 2
     if kind == "auto" and flat:
         assert fit.kind == "ellipsoid"
-
-
-def test_float32_and_points_with_a_graph_are_taken():
-    points = moved(CLOUDS["ellipsoid"]).float().requires_grad_()
-    fit = fit_primitive(points, "ellipsoid")
-    assert fit.pose.dtype == D
-    assert not fit.pose.requires_grad

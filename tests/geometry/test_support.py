@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from torchreg.datasets.solids import RoundBox, RoundCone, mesh_of
-from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp, transform_points
@@ -158,9 +157,3 @@ def test_what_stands_on_nothing_is_kept(name):
         assert not bool(found.mask.any())
     if isinstance(data, TriangleMesh):
         assert found.rest(data) is data
-
-
-def test_bad_points_are_refused():
-    for points in (torch.zeros(0, 3), torch.full((5, 3), torch.nan)):
-        with pytest.raises(InputError, match="data must"):
-            split_support(points)

@@ -1,6 +1,7 @@
 """Surfaces of fields and volumes: closed, oriented, in the right position, by tetrahedra, cubes and voxels."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.errors import InputError
 from torchreg.geometry import isosurface as isosurface_module
-from torchreg.geometry.budget import Budget
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.marching_cubes import marching_cubes
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
@@ -23,10 +22,6 @@ D = torch.float64
 
 def sphere(points):
     return points.norm(dim=-1) - 1
-
-
-def torus(points):
-    return ((points[:, :2].norm(dim=-1) - 1).square() + points[:, 2].square()).sqrt() - 0.4
 
 
 def box(points):
@@ -59,24 +54,6 @@ def test_a_sphere_is_watertight_outward_and_right_to_second_order(dtype):
     assert areas[0] / areas[1] == pytest.approx(4, rel=0.15)
     assert 0 < volumes[1] < 0.024
     assert 0 < areas[1] < 0.04
-
-
-def test_a_torus_has_one_hole():
-    seen = view(isosurface(torus, *cube(1.6), 0.1))
-    assert seen.is_watertight
-    assert seen.is_winding_consistent
-    assert seen.euler_number == 0
-    assert seen.volume == pytest.approx(2 * math.pi**2 * 0.16, rel=0.02)
-
-
-def test_two_bodies_and_a_hollow():
-    centers = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]], dtype=D)
-    two = view(isosurface(lambda p: torch.cdist(p, centers).amin(-1) - 0.6, *cube(1.8), 0.13))
-    assert two.is_watertight
-    assert two.body_count == 2
-    shell = view(isosurface(lambda p: (p.norm(dim=-1) - 1).abs() - 0.3, *cube(1.5), 0.11))
-    assert shell.is_winding_consistent
-    assert shell.volume == pytest.approx(4 / 3 * math.pi * (1.3**3 - 0.7**3), rel=0.02)
 
 
 def test_grid_corners_on_the_surface_are_single_vertices():
@@ -114,11 +91,6 @@ def test_random_blobs_are_closed_oriented_and_have_no_stray_vertices(seed):
     assert seen.volume > 0
 
 
-def test_normals_point_to_positive_values():
-    mesh = isosurface(lambda p: -sphere(p), *cube(1.3), 0.1)
-    assert view(mesh).volume == pytest.approx(-4 / 3 * math.pi, rel=0.01)
-
-
 def test_a_linear_field_is_met_exactly_and_cut_at_the_box():
     normal = torch.tensor([1.0, 2.0, -1.0], dtype=D)
     mesh = isosurface(lambda p: p @ normal - 0.3, *cube(1.0), 0.17)
@@ -128,7 +100,7 @@ def test_a_linear_field_is_met_exactly_and_cut_at_the_box():
 
 
 def test_the_grid_covers_a_box_that_the_spacing_does_not_divide(monkeypatch):
-    monkeypatch.setattr(isosurface_module, "BUDGET", Budget(field_points=7))
+    monkeypatch.setattr(isosurface_module, "BUDGET", replace(isosurface_module.BUDGET, field_points=7))
     low, high = torch.tensor([0.0, 0, 0], dtype=D), torch.tensor([1.0, 0.5, 0.25], dtype=D)
     asked = []
 
@@ -143,22 +115,6 @@ def test_the_grid_covers_a_box_that_the_spacing_does_not_divide(monkeypatch):
     assert bool((points.amax(0) >= high - 1e-12).all())
     assert bool((points.amax(0) < high + 0.3).all())
     assert (mesh.vertices[:, 0] - 0.9).abs().max() < 1e-12
-
-
-def test_no_change_of_sign_gives_no_faces():
-    mesh = isosurface(lambda p: p.norm(dim=-1) + 1, *cube(1.0), 0.5)
-    assert mesh.num_faces == 0
-    assert mesh.num_vertices == 0
-
-
-def test_a_field_with_parameters_leaves_no_graph():
-    radius = torch.tensor(1.0, dtype=D, requires_grad=True)
-    assert not isosurface(lambda p: p.norm(dim=-1) - radius, *cube(1.2), 0.4).vertices.requires_grad
-
-
-def test_a_grid_that_would_be_too_large_is_refused():
-    with pytest.raises(InputError, match="choose a larger one"):
-        isosurface(sphere, *cube(1.0), 1e-3)
 
 
 def sphere_values(size, radius, dtype=torch.float64):
@@ -200,20 +156,6 @@ def test_a_sphere_has_its_volume_and_faces_outwards(dtype):
     assert mesh.num_vertices - mesh.num_faces // 2 == 2  # Euler's formula
 
 
-def test_a_plane_is_met_exactly():
-    axis = torch.arange(6, dtype=torch.float64)
-    values = (axis[:, None, None] + 0.5 * axis[:, None] - axis - 1.3).expand(6, 6, 6)
-    mesh = marching_cubes(values, torch.zeros(3), 1.0)
-    x, y, z = mesh.vertices.unbind(-1)
-    torch.testing.assert_close(x + 0.5 * y - z, torch.full_like(x, 1.3))
-
-
-def test_negating_turns_the_faces_only_where_no_face_of_a_cube_is_ambiguous():
-    values, origin, spacing = sphere_values(20, 0.7)
-    there, back = marching_cubes(values, origin, spacing), marching_cubes(-values, origin, spacing)
-    assert volume(there) == pytest.approx(-volume(back), rel=1e-3)
-
-
 def test_diagonal_neighbors_stay_apart():
     values = torch.ones(4, 5, 5)
     values[1, 1, 1] = values[1, 2, 2] = -1
@@ -221,24 +163,7 @@ def test_diagonal_neighbors_stay_apart():
     assert mesh.num_vertices - mesh.num_faces // 2 == 4  # two spheres
 
 
-def test_origin_and_spacing_move_the_vertices():
-    values, _, _ = sphere_values(12, 0.6)
-    plain = marching_cubes(values, torch.zeros(3), 1.0)
-    moved = marching_cubes(values, torch.tensor([1.0, 2.0, 3.0]), 0.5)
-    torch.testing.assert_close(moved.vertices, 0.5 * plain.vertices + torch.tensor([1.0, 2.0, 3.0]).double())
-    assert torch.equal(moved.faces, plain.faces)
-
-
-def test_a_volume_of_one_sign_gives_no_faces():
-    assert isinstance(marching_cubes(torch.ones(3, 3, 3), torch.zeros(3), 1.0), TriangleMesh)
-    assert marching_cubes(torch.ones(3, 3, 3), torch.zeros(3), 1.0).num_faces == 0
-
-
 SPHERE = unit_sphere(3, dtype=torch.float64)
-
-
-def enclosed_volume(mesh):
-    return float(torch.linalg.det(mesh.vertices.double()[mesh.faces]).sum() / 6)
 
 
 def filled_volume(grid):
@@ -275,12 +200,6 @@ def test_a_sphere_is_filled(mesh):
     assert not bool(grid.filled[0].any() | grid.filled[-1].any())
 
 
-def test_faces_that_are_not_oriented_alike_are_filled_too():
-    faces = SPHERE.faces.clone()
-    faces[::3] = faces[::3].flip(1)
-    assert torch.equal(voxelize(TriangleMesh(SPHERE.vertices, faces), 30).filled, voxelize(SPHERE, 30).filled)
-
-
 def test_a_box_whose_faces_lie_on_the_grid_is_filled_exactly():
     grid = voxelize(box_mesh([1.0, 0.5, 0.25]), 16)
     assert tuple(grid.filled.shape) == (18, 10, 6)
@@ -305,28 +224,15 @@ def test_touching_keeps_what_is_thinner_than_a_voxel():
     assert int(grid.filled.sum()) > 20 * 20
 
 
-def test_scale_and_shift_change_coordinates_only():
-    there = voxelize(SPHERE, 24)
-    moved = voxelize(TriangleMesh(1000 * SPHERE.vertices + 5000, SPHERE.faces), 24)
-    assert torch.equal(there.filled, moved.filled)
-    torch.testing.assert_close(moved.origin, 1000 * there.origin + 5000)
-
-
 @pytest.mark.parametrize("smoothing", [0, 1, 3])
 def test_meshed_anew_the_surface_is_closed_and_holds_the_same_voxels(smoothing):
     grid = voxelize(open_sphere(), 32)
     mesh = grid.mesh(smoothing)
     edges = torch.cat([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     assert torch.equal(edges.unique(dim=0), edges.flip(1).unique(dim=0))
-    assert enclosed_volume(mesh) == pytest.approx(4 / 3 * math.pi, rel=0.05)
+    assert volume(mesh) == pytest.approx(4 / 3 * math.pi, rel=0.05)
     again = voxelize(mesh, 32)
     assert int((grid.filled.sum() - again.contains(grid.centers()).sum()).abs()) <= 0.01 * int(grid.filled.sum())
-
-
-def test_smoothing_brings_the_surface_nearer_to_the_true_one():
-    grid = voxelize(SPHERE, 32)
-    rough, smooth = ((grid.mesh(k).vertices.norm(dim=-1) - 1).abs().mean() for k in (0, 1))
-    assert float(smooth) < 0.7 * float(rough)
 
 
 def test_a_thread_of_single_voxels_survives_smoothing():
@@ -335,9 +241,3 @@ def test_a_thread_of_single_voxels_survives_smoothing():
     mesh = VoxelGrid(filled, torch.zeros(3), 1.0).mesh(2)
     assert mesh.num_vertices - mesh.num_faces // 2 == 2
     assert float(mesh.vertices[:, 0].max() - mesh.vertices[:, 0].min()) > 17
-
-
-def test_voxels_at_the_border_are_closed():
-    mesh = VoxelGrid(torch.ones(2, 2, 2, dtype=torch.bool), torch.zeros(3), 1.0).mesh(0)
-    assert mesh.num_vertices - mesh.num_faces // 2 == 2
-    assert float(mesh.vertices.min()) < 0

@@ -9,8 +9,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.mesh import TriangleMesh, concatenate, even_samples, interpolate, sample_surface, unit_sphere
+from torchreg.geometry.mesh import TriangleMesh, even_samples, interpolate, sample_surface, unit_sphere
 
 
 def bumpy(seed: int = 0, dtype: torch.dtype = torch.float64) -> TriangleMesh:
@@ -42,15 +41,6 @@ def test_vertex_normals_of_a_cube_corner_do_not_depend_on_the_triangulation():
     expected = mesh.vertices / mesh.vertices.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(mesh.vertex_normals(), expected)
     assert not torch.allclose(mesh.vertex_normals("area"), expected)
-
-
-def test_area_weighting_is_the_sum_of_cross_products():
-    mesh = bumpy()
-    total = torch.zeros(42, 3, dtype=torch.float64)
-    for face in mesh.faces:
-        a, b, c = mesh.vertices[face]
-        total[face] += torch.linalg.cross(b - a, c - a)
-    torch.testing.assert_close(mesh.vertex_normals("area"), total / total.norm(dim=-1, keepdim=True))
 
 
 def test_isolated_vertices_and_flat_faces_give_zero_and_finite_gradients():
@@ -94,45 +84,6 @@ def test_normals_turn_with_the_mesh(seed):
     torch.testing.assert_close(turned.face_areas(), mesh.face_areas())
 
 
-def test_mesh_moves_between_dtypes_and_takes_lists():
-    mesh = TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    assert mesh.vertices.dtype == torch.float32
-    assert mesh.faces.dtype == torch.int64
-    moved = mesh.to(torch.float64)
-    assert moved.vertices.dtype == torch.float64
-    assert moved.faces.dtype == torch.int64
-    assert (moved.num_vertices, moved.num_faces) == (3, 1)
-    assert TriangleMesh(torch.zeros(1, 3), torch.zeros(0, 3, dtype=torch.int32)).vertex_normals().eq(0).all()
-    assert TriangleMesh(torch.zeros(1, 3), []).num_faces == 0
-
-
-@pytest.mark.parametrize(
-    ("vertices", "faces", "error", "words"),
-    [
-        (torch.zeros(3, 2), [[0, 1, 2]], InputError, r"vertices must have shape \(V, 3\), got \(3, 2\)"),
-        (torch.full((3, 3), math.nan), [[0, 1, 2]], InputError, "vertices must be finite, got 9 non-finite of 9"),
-        (torch.zeros(3, 3), [[0, 1, 3]], InputError, r"index the 3 vertices \(0 to 2\), got indices from 0 to 3"),
-        (torch.zeros(3, 3), [[0, -1, 2]], InputError, "from -1 to 2"),
-        (torch.zeros(3, 3), [[0, 1]], InputError, r"faces must have shape \(F, 3\)"),
-        (torch.zeros(3, 3), [[0.0, 1.0, 2.0]], InputTypeError, "faces must hold integers"),
-        (torch.zeros(3, 3), "none", InputTypeError, "faces must be an"),
-    ],
-)
-def test_bad_meshes_are_refused(vertices, faces, error, words):
-    with pytest.raises(error, match=words):
-        TriangleMesh(vertices, faces)
-
-
-def test_wrong_choices_are_refused():
-    with pytest.raises(InputError, match="weighting must be one of angle, area"):
-        bumpy().vertex_normals("size")
-    with pytest.raises(InputError, match="at least 1 point"):
-        TriangleMesh(torch.zeros(0, 3), []).bounds()
-    for subdivisions in (-1, 9, 1.5, True):
-        with pytest.raises(InputError, match="subdivisions must be an integer from 0 to 8"):
-            unit_sphere(subdivisions)
-
-
 @pytest.mark.parametrize("subdivisions", [0, 1, 3])
 def test_sphere_is_closed_round_and_faces_outward(subdivisions):
     mesh = unit_sphere(subdivisions, dtype=torch.float64)
@@ -144,13 +95,6 @@ def test_sphere_is_closed_round_and_faces_outward(subdivisions):
     torch.testing.assert_close(mesh.vertices.norm(dim=-1), torch.ones(mesh.num_vertices, dtype=torch.float64))
     assert (torch.diff(mesh.face_areas().sort().values) >= 0).all()
     torch.testing.assert_close(mesh.vertex_normals(), mesh.vertices, atol=0.02, rtol=0)
-
-
-def test_concatenate_keeps_the_order():
-    first, second = bumpy(0), bumpy(1)
-    both = concatenate([first, second])
-    torch.testing.assert_close(both.face_areas(), torch.cat((first.face_areas(), second.face_areas())))
-    assert both.num_vertices == 84
 
 
 def test_samples_lie_on_their_face_and_follow_the_area():
@@ -180,22 +124,6 @@ def test_sampling_is_reproducible_and_leaves_the_global_generator_alone():
     assert not torch.equal(sample_surface(mesh, 50, generator)[0], sample_surface(mesh, 50, generator)[0])
     assert sample_surface(mesh, 0)[0].shape == (0, 3)
     assert first.dtype == torch.float32
-
-
-def test_sampling_is_differentiable_in_the_vertices():
-    sphere = unit_sphere(0, dtype=torch.float64)
-
-    def scaled(scale: torch.Tensor) -> torch.Tensor:
-        return sample_surface(TriangleMesh(sphere.vertices * scale, sphere.faces), 7)[0]
-
-    # A uniform scale leaves the drawn faces as they are, so finite differences see the same function.
-    assert torch.autograd.gradcheck(scaled, (torch.tensor(1.3, dtype=torch.float64, requires_grad=True),))
-
-
-def test_sampling_needs_a_surface():
-    for faces in ([], [[0, 1, 2]]):
-        with pytest.raises(InputError, match="mesh must have a surface to sample"):
-            sample_surface(TriangleMesh(torch.zeros(3, 3), faces), 5)
 
 
 def test_interpolation_reproduces_linear_fields():

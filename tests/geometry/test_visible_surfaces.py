@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from torchreg.errors import InputError
 from torchreg.geometry import visibility, z_buffer
-from torchreg.geometry.budget import Budget
 from torchreg.geometry.mesh import TriangleMesh, concatenate, interpolate, unit_sphere
 from torchreg.geometry.visibility import aim, rasterize, sample_visible, view_rotation, visible_points
 
@@ -50,21 +49,6 @@ def test_view_rotation_looks_at_the_target_with_up_upwards(seed):
     assert upright[1] < 0
 
 
-def test_the_default_camera_looks_along_z_with_y_down():
-    rotation = view_rotation(torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    torch.testing.assert_close(rotation, torch.eye(3, dtype=torch.float64))
-
-
-def test_view_rotation_finds_another_axis_when_it_looks_along_up():
-    rotation = view_rotation(torch.zeros(3), torch.tensor([0.0, 2.0, 0.0]))
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
-
-
-def test_view_rotation_refuses_a_camera_in_the_target():
-    with pytest.raises(InputError, match="camera must lie away from the target"):
-        view_rotation(torch.ones(3), torch.ones(3))
-
-
 def test_project_divides_by_depth():
     square = quad(1.0).vertices
     view = aim(square, torch.zeros(3), size=100)
@@ -94,22 +78,6 @@ def test_aim_frames_every_point(parallel, size):
     assert bool((pixels > 0).all())
     assert bool((pixels < torch.tensor([view.width, view.height])).all())
     assert max(view.width, view.height) == (64 if size == 64 else 90)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"camera": torch.tensor([0.5, 0.0, 0.0])}, "camera must have all of the points before it"),
-        ({"size": 0}, "size must be 1 to"),
-        ({"size": (10, 20, 30)}, "size must be 1 to"),
-        ({"size": (10, 100_000)}, "size must be 1 to"),
-        ({"camera": torch.zeros(2)}, r"camera must have shape \(3\)"),
-        ({"camera": torch.tensor([0.0, math.nan, 0.0])}, "camera must be finite"),
-    ],
-)
-def test_aim_refuses(options, message):
-    with pytest.raises(InputError, match=message):
-        aim(unit_sphere(1).vertices, **{"camera": CAMERA, **options})
 
 
 @pytest.mark.parametrize("parallel", [False, True])
@@ -144,7 +112,7 @@ def test_rasterizing_in_chunks_changes_nothing(monkeypatch):
     mesh = concatenate([unit_sphere(2, dtype=torch.float64), quad(-1.2, 0.5)])
     view = aim(mesh.vertices, CAMERA, size=40)
     whole = rasterize(mesh, view)
-    monkeypatch.setattr(z_buffer, "BUDGET", Budget(raster_pixels=100))
+    monkeypatch.setattr(z_buffer, "BUDGET", replace(z_buffer.BUDGET, raster_pixels=100))
     parts = rasterize(mesh, view)
     torch.testing.assert_close(parts.face_index, whole.face_index)
     torch.testing.assert_close(parts.barycentric, whole.barycentric)
@@ -162,12 +130,6 @@ def test_culling_drops_faces_seen_from_behind():
     assert bool(empty.depth.isinf().all())
 
 
-def test_rasterize_refuses_a_mesh_behind_the_camera():
-    view = aim(quad(1.0).vertices, CAMERA, size=8)
-    with pytest.raises(InputError, match="mesh must lie before the camera, got 2 faces"):
-        rasterize(quad(-4.0), view)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_sphere_hides_its_far_side(dtype):
     mesh = unit_sphere(4, dtype=dtype)
@@ -176,17 +138,6 @@ def test_a_sphere_hides_its_far_side(dtype):
     seen = visible_points(mesh, mesh.vertices, 3 * direction)
     assert bool(seen[facing > 0.03].all())
     assert not bool(seen[facing < -0.1].any())
-
-
-def test_visibility_turns_with_the_scene():
-    mesh = concatenate([unit_sphere(2, dtype=torch.float64), quad(-1.5, 0.4, (0.3, 0.2))])
-    camera = torch.tensor([0.5, 0.2, -4.0], dtype=torch.float64)
-    points = 1.5 * torch.randn(300, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)).Q
-    turn = turn * turn.det()
-    first = visible_points(mesh, points, camera)
-    second = visible_points(TriangleMesh(mesh.vertices @ turn.mT, mesh.faces), points @ turn.mT, turn @ camera)
-    assert float((first == second).double().mean()) > 0.98
 
 
 def test_points_before_beside_behind_and_behind_the_camera():
@@ -233,22 +184,6 @@ def test_hidden_parts_give_no_samples():
         assert 0.1 < float(back.double().mean()) < 0.95
         # The near square's shadow at depth 5 is 5/3 wide.
         assert float(points[back][:, :2].abs().amax(-1).min()) > 1.63
-
-
-def test_sheets_seen_from_behind_give_no_samples():
-    with pytest.raises(InputError, match="turn a face to the camera"):
-        sample_visible(quad(0.0), torch.tensor([0.0, 0.0, 3.0]), 5)
-
-
-def test_samples_repeat_and_leave_the_global_generator_alone():
-    mesh = unit_sphere(2)
-    state = torch.get_rng_state()
-    first = sample_visible(mesh, CAMERA, 50)[0]
-    torch.testing.assert_close(first, sample_visible(mesh, CAMERA, 50)[0], rtol=0, atol=0)
-    other = sample_visible(mesh, CAMERA, 50, torch.Generator().manual_seed(7))[0]
-    assert not torch.equal(first, other)
-    assert torch.equal(state, torch.get_rng_state())
-    assert sample_visible(mesh, CAMERA, 0)[0].shape == (0, 3)
 
 
 def test_samples_are_differentiable_in_the_vertices():

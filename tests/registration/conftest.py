@@ -1,4 +1,4 @@
-"""A limb of three bones, and parts of a figure, that the tests of scan registration share."""
+"""A limb of three bones, and turns about points, that the tests of scan registration share."""
 
 import math
 from types import SimpleNamespace
@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from torchreg.geometry.rigid import rigid_matrix, se3_exp
-from torchreg.geometry.rotation import so3_exp
+import torchreg as tr
+from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.bones.correspondences import Correspondences
-from torchreg.registration.bones.grid_lbs import GridLBS
-from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
+from torchreg.registration.bones.motion_problem import BoneProblem
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
 BONES = 3
@@ -18,6 +17,14 @@ BONES = 3
 
 def draw(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def turned_about(point, vector):
+    """Return the motion (4, 4) that turns by a rotation vector about a point."""
+    point, vector = (torch.as_tensor(value, dtype=torch.float64) for value in (point, vector))
+    motion = se3_exp(torch.cat([torch.zeros_like(vector), vector]))
+    motion[:3, 3] = point - motion[:3, :3] @ point
+    return motion
 
 
 def limb(count=400):
@@ -32,47 +39,36 @@ def limb(count=400):
 def model_of(points, blend="linear", resolution=24):
     grid = SparseGrid.from_points(points, resolution, frame="world")
     labels = grid.cell_centers()[:, 0].long().clamp(0, BONES - 1)
-    return GridLBS.from_labels(grid, labels, BONES, blend=blend)
+    return tr.GridLBS.from_labels(grid, labels, BONES, blend=blend)
 
 
 def bent(angle=0.6):
     """Motions of the limb: bent at x = 1 and x = 2."""
     motions = [torch.eye(4, dtype=torch.float64)]
     for place in (1.0, 2.0):
-        pivot = torch.tensor([place, 0.05 * place, 0], dtype=torch.float64)
-        turn = so3_exp(torch.tensor([0.2 * angle, 0, angle], dtype=torch.float64))
-        motions.append(motions[-1] @ rigid_matrix(turn, pivot - turn @ pivot))
+        motions.append(motions[-1] @ turned_about([place, 0.05 * place, 0], [0.2 * angle, 0, angle]))
     return se3_exp(torch.tensor([0.1, -0.2, 0.1, 0.2, 0.1, 0], dtype=torch.float64)) @ torch.stack(motions)
 
 
 def problem_of(points, weights, targets, normals=None, match_weights=None, point_to_point=0.0, **terms):
     """The energy of bones with weights at points, matched with targets."""
-    weights = weights.detach()
     match_weights = torch.ones_like(targets[..., 0]) if match_weights is None else match_weights
-    return BoneProblem(
-        points=points,
-        binding=Binding.from_weights(weights),
-        correspondences=Correspondences(targets, normals, match_weights, point_to_point),
-        bodies=BoneBodies.from_weights(points, weights),
-        **terms,
-    )
+    matches = Correspondences(targets, normals, match_weights, point_to_point)
+    return BoneProblem.of_weights(points, weights.detach(), matches, **terms)
 
 
 def noisy_problem(blend="linear", share=0.0, batch=(2,)):
     points, _ = limb(60)
     model = model_of(points, blend, 8)
     with torch.no_grad():
-        weights = model.weights_at(points)
-        moments = model.joint_moments()
+        weights, moments = model.weights_at(points), model.joint_moments()
     normals = torch.nn.functional.normalize(draw(*batch, 60, 3, seed=1), dim=-1)
-    match_weights = draw(*batch, 60, seed=2).clamp_min(0)
-    targets = points + 0.1 * draw(*batch, 60, 3, seed=3)
     problem = problem_of(
         points,
         weights,
-        targets,
+        points + 0.1 * draw(*batch, 60, 3, seed=3),
         normals,
-        match_weights,
+        draw(*batch, 60, seed=2).clamp_min(0),
         share,
         moments=moments,
         joint_weight=0.7,
@@ -87,17 +83,5 @@ def noisy_problem(blend="linear", share=0.0, batch=(2,)):
 @pytest.fixture(scope="session")
 def bones():
     """A limb of three bones: how to make it, its model, poses and noisy matches."""
-    makers = (draw, limb, model_of, bent, problem_of, noisy_problem)
+    makers = (draw, turned_about, limb, model_of, bent, problem_of, noisy_problem)
     return SimpleNamespace(COUNT=BONES, **{maker.__name__: maker for maker in makers})
-
-
-@pytest.fixture(scope="session")
-def lower_legs():
-    """Return a function of a problem and its pair of a figure: samples (S,) of the left and of the right lower leg."""
-
-    def find(problem, pair):
-        names, labels = pair.part_names, pair.labels[problem.samples]
-        below = [[names.index(f"{side} {part}") for part in ("shin", "foot")] for side in ("left", "right")]
-        return [torch.isin(labels, torch.tensor(parts)) for parts in below]
-
-    return find

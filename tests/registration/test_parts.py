@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from torchreg.registration.results import ScanRegistration, SequenceRegistration
-from torchreg.result import Status
+import torchreg as tr
 
 
 def bones(*shifts, weights):
@@ -14,7 +13,7 @@ def bones(*shifts, weights):
     labels = weights.argmax(-1)
     deformed = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]) + motions[labels, :3, 3]
     empty = torch.zeros(4)
-    return ScanRegistration(
+    return tr.ScanRegistration(
         torch.nn.Identity(),
         deformed,
         None,
@@ -24,7 +23,7 @@ def bones(*shifts, weights):
         weights,
         empty,
         empty > 0,
-        Status.CONVERGED,
+        tr.Status.CONVERGED,
         empty,
     )
 
@@ -51,9 +50,9 @@ def test_parts_of_a_sequence_moved_as_one_in_every_frame():
         )
         first = frames[0]
         nothing = torch.zeros(0, 3)
-        return SequenceRegistration(
+        return tr.SequenceRegistration(
             torch.nn.Identity(), first.points, None, deformed, first.labels, transforms, first.weights,
-            nothing, nothing, nothing[:, 0].long(), 0, Status.CONVERGED,
+            nothing, nothing, nothing[:, 0].long(), 0, tr.Status.CONVERGED,
         ).parts()  # fmt: skip
 
     assert parts(*frames).tolist() == parts(*frames[::-1]).tolist() == [0, 0, 1, 2]
@@ -70,9 +69,9 @@ def chain(order, step):
     labels = weights.argmax(1)
     deformed = torch.stack([torch.arange(24.0), motions[labels, 1, 3], torch.zeros(24)], dim=1)
     empty = torch.zeros(24)
-    return ScanRegistration(
+    return tr.ScanRegistration(
         torch.nn.Identity(), deformed, None, deformed, labels, motions, weights, empty, empty > 0,
-        Status.CONVERGED, empty,
+        tr.Status.CONVERGED, empty,
     )  # fmt: skip
 
 

@@ -60,34 +60,6 @@ def run(place=STARTS, max_steps=200, **options):
     return damped_descent(banana, solve, place, damping, rule=RULE, max_steps=max_steps, **options)
 
 
-def test_the_minimum_of_rosenbrock_is_found():
-    found = run()
-    torch.testing.assert_close(torch.stack(found.state, -1), torch.ones(3, 2, dtype=D))
-    assert float(found.system.cost.max()) < 1e-12
-
-
-def test_costs_never_rise_and_the_system_is_that_of_the_state():
-    last = banana(STARTS).cost
-    for steps in range(1, 12):
-        found = run(max_steps=steps)
-        assert bool((found.system.cost <= last).all())
-        for value, expected in zip(found.system, banana(found.state), strict=True):
-            torch.testing.assert_close(value, expected)
-        last = found.system.cost
-
-
-def test_problems_of_a_batch_proceed_by_themselves():
-    def settled(trial, before, after):
-        return (before - after).abs() <= 1e-3 * before
-
-    both = run(converged=settled)
-    for row in range(3):
-        alone = run(Place(*(value[row : row + 1] for value in STARTS)), converged=settled)
-        torch.testing.assert_close(both.state.x[row : row + 1], alone.state.x)
-        assert bool(alone.done)
-    assert both.num_steps < 200
-
-
 def test_steps_that_are_not_sound_change_nothing_but_the_damping():
     found = run(max_steps=1, converged=lambda trial, before, after: torch.ones_like(before, dtype=torch.bool))
     assert torch.equal(found.state.x, STARTS.x)
@@ -183,13 +155,6 @@ def test_minima_are_those_of_scipy(name, bounded):
     assert result.num_steps == 100
 
 
-def test_a_linear_problem_is_solved_in_a_few_steps():
-    a = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=D)
-    b = torch.arange(9.0, dtype=D)
-    result = levenberg_marquardt(problem(lambda x: a @ x - b), torch.zeros(1, 4, dtype=D), max_steps=6)
-    torch.testing.assert_close(result.state[0], torch.linalg.lstsq(a, b).solution, atol=1e-9, rtol=0)
-
-
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 100_000))
 def test_bounded_linear_problems_meet_the_optimality_conditions(seed):
@@ -225,19 +190,6 @@ def test_an_increase_is_never_accepted(seed):
         state, damping = result.state, result.damping
     # Stepping once with the damping carried on is the same as stepping twelve times.
     torch.testing.assert_close(levenberg_marquardt(linearize, start, max_steps=12).state, state)
-
-
-def test_a_rejected_step_keeps_the_state_and_raises_the_damping():
-    def linearize(state):
-        # The gradient points the wrong way: every step raises the cost.
-        return Linearization(0.5 * state.square().sum(-1), -state, torch.eye(2, dtype=D).expand(1, 2, 2))
-
-    start = torch.ones(1, 2, dtype=D)
-    result = levenberg_marquardt(linearize, start, max_steps=4)
-    assert torch.equal(result.state, start)
-    assert result.last_step.tolist() == [[0, 0]]
-    assert float(result.damping) == pytest.approx(1e-3 * 6**4)
-    assert float(levenberg_marquardt(linearize, start, max_steps=40).damping) == 1e7
 
 
 def test_a_step_that_brings_little_is_kept_but_raises_the_damping():
@@ -321,12 +273,6 @@ def test_limits_clamp_the_start_freeze_and_release():
     assert result.state.tolist() == [[1.0, 0.5]]
 
 
-def test_limits_may_differ_over_the_batch():
-    low = torch.tensor([[-5.0], [2.0]], dtype=D)
-    result = levenberg_marquardt(problem(lambda x: x - 1), torch.zeros(2, 1, dtype=D), lower=low, max_steps=10)
-    torch.testing.assert_close(result.state, torch.tensor([[1.0], [2.0]], dtype=D))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_singular_problems_converge_and_hold_what_nothing_constrains(dtype):
     a = torch.randn(6, 3, generator=torch.Generator().manual_seed(0), dtype=dtype)
@@ -359,18 +305,6 @@ def test_a_hessian_without_a_factor_raises_the_damping_until_it_has_one():
     assert float(result.cost) < 1e-6
 
 
-def test_stopping():
-    linearize = problem(lambda x: x - 1)
-    start = torch.zeros(2, 3, dtype=D)
-    result = levenberg_marquardt(linearize, start, max_steps=50, atol=1e-6)
-    assert 2 <= result.num_steps < 10
-    assert result.last_step.abs().max() < 1e-2
-    none = levenberg_marquardt(linearize, start, max_steps=0)
-    assert none.num_steps == 0
-    assert torch.equal(none.state, start)
-    torch.testing.assert_close(none.cost, torch.full((2,), 1.5, dtype=D))
-
-
 @pytest.mark.parametrize("max_steps", [0, 1, 3, 8])
 def test_a_known_start_and_a_cheap_cost_save_linearizations_and_change_nothing(max_steps):
     seen, bare = [], problem(rosenbrock)
@@ -382,12 +316,6 @@ def test_a_known_start_and_a_cheap_cost_save_linearizations_and_change_nothing(m
     for name in ("state", "cost", "damping", "last_step"):
         torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0)
     assert len(seen) == max(max_steps - 1, 0)
-
-
-def test_an_empty_batch_is_no_problem():
-    empty = Linearization(torch.zeros(0), torch.zeros(0, 2), torch.zeros(0, 2, 2))
-    result = levenberg_marquardt(lambda _: empty, torch.zeros(0, 2), max_steps=2, atol=1e-3)
-    assert result.state.shape == (0, 2)
 
 
 def test_the_damped_step_is_marquardts():
@@ -407,12 +335,14 @@ def test_the_damped_step_is_marquardts():
     torch.testing.assert_close(held[:, keep], reduced, rtol=1e-8, atol=0)
 
 
-def test_mixed_units_are_sound_in_float32():
-    scale = torch.tensor([0.05, 1.0, 20.0])
-    a = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
-    truth = torch.tensor([1.0, 2.0, 3.0]) / scale
-    result = levenberg_marquardt(
-        problem(lambda x: (a * scale) @ (x - truth)), torch.zeros(1, 3), max_steps=10, damping=torch.tensor([1e-3])
-    )
-    assert result.state.dtype == torch.float32
-    torch.testing.assert_close(result.state[0], truth, rtol=1e-4, atol=0)
+def test_a_rejected_step_keeps_the_state_and_raises_the_damping():
+    def linearize(state):
+        # The gradient points the wrong way: every step raises the cost.
+        return Linearization(0.5 * state.square().sum(-1), -state, torch.eye(2, dtype=D).expand(1, 2, 2))
+
+    start = torch.ones(1, 2, dtype=D)
+    result = levenberg_marquardt(linearize, start, max_steps=4)
+    assert torch.equal(result.state, start)
+    assert result.last_step.tolist() == [[0, 0]]
+    assert float(result.damping) == pytest.approx(1e-3 * 6**4)
+    assert float(levenberg_marquardt(linearize, start, max_steps=40).damping) == 1e7

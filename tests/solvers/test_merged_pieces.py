@@ -60,11 +60,3 @@ def test_numbers_of_pieces_do_not_matter(seed):
         merge_alike(apart[which][:, which].unsqueeze(0), counts[which], ALL, 0.3) for which in (torch.arange(4), order)
     )
     assert groups(plain) == {tuple(sorted(order[list(part)].tolist())) for part in groups(other)}
-
-
-def test_arguments_stay_as_they_are():
-    apart, counts = row(0.0, 0.0, 0.0, 0.0)
-    meet = ALL.clone()
-    merge_alike(apart.unsqueeze(0), counts, meet, 1.0)
-    assert torch.equal(apart, row(0.0, 0.0, 0.0, 0.0)[0])
-    assert torch.equal(meet, ALL)

@@ -6,7 +6,7 @@ import scipy.sparse as sp
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import lsq_linear, minimize
+from scipy.optimize import minimize
 from scipy.optimize import nnls as dense_nnls
 
 import torchreg.solvers.nnls as module
@@ -69,14 +69,7 @@ def test_small_dense_problems_agree_with_scipy(seed, rows, columns):
     assert (result.x >= 0).all()
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_solution_itself_is_scipys_where_it_is_unique(seed):
-    matrix, target = dense_problem(seed, 60, 25)
-    expected = torch.from_numpy(dense_nnls(matrix, target)[0])
-    torch.testing.assert_close(solved(sp.csr_matrix(matrix), target).x, expected, atol=1e-6, rtol=1e-6)
-
-
-def test_a_problem_of_weights_agrees_with_two_other_methods():
+def test_a_problem_of_weights_agrees_with_another_method():
     matrix, target, start = weight_problem()
     result = solved(matrix, torch.from_numpy(target), start=torch.from_numpy(start))
     assert len(result.x) == 1536
@@ -93,37 +86,6 @@ def test_a_problem_of_weights_agrees_with_two_other_methods():
     )
     assert result.objective == pytest.approx(oracle.fun, rel=1e-6)
     assert result.objective <= oracle.fun * (1 + 1e-9)
-    interior = lsq_linear(matrix, target, bounds=(0, np.inf), tol=1e-10, max_iter=60)
-    assert result.objective == pytest.approx(2 * interior.cost, rel=1e-6)
-
-
-def test_every_start_leads_to_the_same_solution():
-    matrix, target, start = weight_problem(side=10)
-    expected = solved(matrix, target, start=start)
-    for first in (None, np.zeros(len(start)), (start == 0).astype(float)):
-        result = solved(matrix, target, start=first)
-        assert result.converged
-        torch.testing.assert_close(result.x, expected.x, atol=1e-6, rtol=0)
-
-
-def test_the_solution_as_start_needs_no_round():
-    matrix, target, start = weight_problem(side=10)
-    cold = solved(matrix, target, start=start)
-    warm = solved(matrix, target, start=cold.x)
-    assert warm.num_steps == 0
-    assert warm.num_solves < cold.num_solves
-    torch.testing.assert_close(warm.x, cold.x, atol=1e-7, rtol=0)
-
-
-def test_sums_of_one_held_by_a_penalty_come_out_as_one():
-    matrix, target, start = weight_problem(side=8)
-    sums = sp.kron(sp.eye(64), np.ones((1, 6)))
-    tight = solved(sp.vstack([matrix, 1e3 * sums]), np.r_[target, 1e3 * np.ones(64)], start=start)
-    loose = solved(matrix, target, start=start)
-    totals = tight.x.reshape(64, 6).sum(1)
-    assert tight.converged
-    torch.testing.assert_close(totals, torch.ones_like(totals), atol=1e-5, rtol=0)
-    assert (loose.x.reshape(64, 6).sum(1) - 1).abs().max() > 0.05
 
 
 def test_every_form_of_matrix_gives_the_same():
@@ -136,13 +98,6 @@ def test_every_form_of_matrix_gives_the_same():
         assert torch.equal(solution, solutions[0])
 
 
-def test_the_solution_takes_the_dtype_of_the_target():
-    matrix, target = dense_problem(3)
-    result = solved(torch.from_numpy(matrix).float(), torch.from_numpy(target).float())
-    assert result.x.dtype == torch.float32
-    assert result.objective == pytest.approx(dense_nnls(matrix, target)[1] ** 2, rel=1e-5)
-
-
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
 def test_units_of_variables_and_of_the_target_change_nothing_but_units(scale):
     matrix, target = dense_problem(5)
@@ -150,12 +105,6 @@ def test_units_of_variables_and_of_the_target_change_nothing_but_units(scale):
     plain, other = solved(matrix, target), solved(matrix * units, target * scale)
     torch.testing.assert_close(other.x * torch.from_numpy(units) / scale, plain.x, atol=1e-9, rtol=1e-7)
     assert other.kkt_residual <= 1e-7
-
-
-def test_permuted_variables_give_the_permuted_solution():
-    matrix, target = dense_problem(6)
-    order = np.random.default_rng(0).permutation(12)
-    torch.testing.assert_close(solved(matrix[:, order], target).x, solved(matrix, target).x[order])
 
 
 def test_a_step_too_few_is_no_convergence_but_a_sound_point():

@@ -6,7 +6,6 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import nnls
 
 from torchreg.solvers.simplex import nearest_on_simplex
 
@@ -47,14 +46,6 @@ def test_the_nearest_point_of_the_simplex_is_found(rows, dtype):
     assert found.dtype == dtype
     expected = np.array([best_of_all_supports(row) for row in rows.double()])
     np.testing.assert_allclose(found.double().numpy(), expected, atol=1e-6, rtol=0)
-
-
-def test_it_is_scipys_non_negative_least_squares_with_a_firm_sum():
-    firm = 1e4
-    for row in draw(10, 8, seed=4):
-        matrix = np.vstack([np.eye(8), firm * np.ones(8)])
-        expected, _ = nnls(matrix, np.append(row.numpy(), firm))
-        np.testing.assert_allclose(nearest_on_simplex(row).numpy(), expected, atol=1e-6)
 
 
 def test_what_changes_nothing():

@@ -7,15 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchreg.errors import InputError, InputTypeError, MissingExtraError
-from torchreg.geometry.mesh import unit_sphere
-from torchreg.geometry.range_scan import RangeScan
-from torchreg.geometry.skeleton import Skeleton
-from torchreg.io.points import PointCloud
-from torchreg.viz.bone_colors import bone_palette
-from torchreg.viz.conversions import to_open3d, to_pyvista, to_trimesh
+import torchreg as tr
+from torchreg.viz import bone_colors
 
-BALL = unit_sphere(1)
+to_open3d, to_pyvista, to_trimesh = tr.to_open3d, tr.to_pyvista, tr.to_trimesh
+BALL = tr.TriangleMesh(torch.eye(4, 3), torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
 
 
 class PolyData:
@@ -43,7 +39,7 @@ def test_meshes_and_scans(stand_ins):
     mesh = to_trimesh(BALL)
     np.testing.assert_allclose(mesh.vertices, BALL.vertices)
     np.testing.assert_array_equal(mesh.faces, BALL.faces)
-    scan = RangeScan(BALL.vertices, BALL.faces)
+    scan = tr.RangeScan(BALL.vertices, BALL.faces)
     other = to_open3d(scan)
     assert type(other).__name__ == "TriangleMesh"
     np.testing.assert_allclose(other.vertex_normals, scan.normals)
@@ -53,7 +49,7 @@ def test_meshes_and_scans(stand_ins):
 
 
 def test_points_and_their_colors(stand_ins):
-    cloud = PointCloud(BALL.vertices, colors=BALL.vertices.abs().clamp(0, 1))
+    cloud = tr.PointCloud(BALL.vertices, colors=BALL.vertices.abs().clamp(0, 1))
     assert to_trimesh(cloud).colors.shape == (len(cloud), 4)
     np.testing.assert_allclose(to_open3d(cloud).colors, cloud.colors, atol=1e-6)
     np.testing.assert_array_equal(to_pyvista(cloud).point_data["rgb"], (255 * cloud.colors).round())
@@ -65,7 +61,7 @@ def test_results(stand_ins, alignment, registration, sequence):
     np.testing.assert_allclose(to_trimesh(alignment).vertices, alignment.registered, atol=1e-6)
     moved = to_trimesh(registration)
     np.testing.assert_allclose(moved.vertices, registration.deformed)
-    paint = registration.weights @ bone_palette(3).double()
+    paint = registration.weights @ bone_colors.bone_palette(3).double()
     np.testing.assert_allclose(moved.visual.vertex_colors[:, :3], 255 * paint, atol=0.6)
     np.testing.assert_allclose(to_open3d(sequence, 1).points, sequence.deformed[1])
     np.testing.assert_allclose(to_open3d(sequence, 1).vertex_colors, paint, atol=1e-6)
@@ -77,29 +73,29 @@ def test_curves(stand_ins, spine):
     assert path.length == pytest.approx(3.03, abs=0.1)
     lines = to_open3d(spine)
     assert lines.cells.shape == (21, 2)
-    np.testing.assert_allclose(lines.colors[0], bone_palette(3)[0], atol=0.003)
+    np.testing.assert_allclose(lines.colors[0], bone_colors.bone_palette(3)[0], atol=0.003)
     data = to_pyvista(spine.model.skeleton(1.0))
     assert data.lines.reshape(-1, 3)[:, 0].tolist() == [2] * 21
     assert data.cell_data["rgb"].shape == (21, 3)
-    tree = Skeleton(torch.eye(3), torch.tensor([[0, 1], [1, 2]]), torch.ones(3))
+    tree = tr.Skeleton(torch.eye(3), torch.tensor([[0, 1], [1, 2]]), torch.ones(3))
     assert to_trimesh(tree).length == pytest.approx(2 * 2**0.5)
 
 
 def test_what_does_not_fit_is_refused(monkeypatch, sequence, spine):
-    with pytest.raises(InputError, match="frame must be from 0 to 1, got 2"):
+    with pytest.raises(tr.errors.InputError, match="frame must be from 0 to 1, got 2"):
         to_trimesh(sequence, 2)
-    with pytest.raises(InputError, match="frame must be from 0 to 2"):
+    with pytest.raises(tr.errors.InputError, match="frame must be from 0 to 2"):
         to_trimesh(spine, -1)
-    with pytest.raises(InputTypeError, match="got str"):
+    with pytest.raises(tr.errors.InputTypeError, match="got str"):
         to_trimesh("mesh.ply")
     for name, convert in (("open3d", to_open3d), ("pyvista", to_pyvista)):
         monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(MissingExtraError, match=rf"pip install 'torchreg-articulated\[{name}\]'"):
+        with pytest.raises(tr.errors.MissingExtraError, match=rf"pip install 'torchreg-articulated\[{name}\]'"):
             convert(BALL)
 
 
 @pytest.mark.parametrize(("name", "convert"), [("open3d", to_open3d), ("pyvista", to_pyvista)])
 def test_the_libraries_themselves_take_it_all(name, convert, registration, spine, alignment):
     pytest.importorskip(name, reason=f"{name} is not installed")
-    for value in (BALL, RangeScan(BALL.vertices, BALL.faces), registration, spine, alignment):
+    for value in (BALL, tr.RangeScan(BALL.vertices, BALL.faces), registration, spine, alignment):
         convert(value)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.registration.register import register
 
 CHROMIUM = os.environ.get("TORCHREG_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 # WebGL without a graphics card.
@@ -72,4 +72,4 @@ def toy_pair():
 
 @pytest.fixture(scope="session")
 def registered_toy(toy_pair):
-    return register(toy_pair.source, toy_pair.target, 8, 40, start=toy_pair.truth)
+    return tr.register(toy_pair.source, toy_pair.target, 8, 40, start=toy_pair.truth)

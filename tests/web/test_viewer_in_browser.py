@@ -5,15 +5,10 @@ import io
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
-from torchreg.datasets.hand import hand_motion, make_hand_cloud
-from torchreg.geometry.mesh import unit_sphere
-from torchreg.result import Status
-from torchreg.shapes.hand import Hand
-from torchreg.spines.results import SpineSequence
-from torchreg.spines.spine import Spine
-from torchreg.tracking.results import TrackResult
+import torchreg as tr
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Scene
 from torchreg.viz.viewer import SceneViewer, scene_html
@@ -22,15 +17,20 @@ BACKGROUND = 250
 
 
 def track_scene():
-    hand = Hand()
-    poses = hand_motion(hand, "bend", 4)
-    clouds = [make_hand_cloud(hand, pose, num_points=300, camera=torch.zeros(3)).points for pose in poses]
-    count = len(poses)
-    track = TrackResult(
-        poses, torch.zeros_like(poses), hand.keypoints(poses).detach(), torch.ones(count), torch.ones(count),
-        torch.arange(float(count)) / 20, torch.ones(count), (Status.CONVERGED,) * count, ("tracked",) * count,
+    hand = tr.Hand().requires_grad_(False)
+    poses = hand.rest_pose().repeat(4, 1)
+    poses[:, 2], poses[:, 6:] = 0.5, torch.linspace(0, 0.6, 4)[:, None] * hand.upper[6:]
+    ones, converged = torch.ones(4), (tr.Status.CONVERGED,) * 4
+    track = tr.TrackResult(
+        poses, torch.zeros_like(poses), hand.keypoints(poses), ones, ones, torch.arange(4.0) / 20, ones, converged,
+        ("tracked",) * 4,
     )  # fmt: skip
-    return result_scene(track, shape=hand, data=clouds)
+    return result_scene(track, shape=hand, data=list(track.keypoints + 0.002))
+
+
+def ball(level):
+    mesh = trimesh.creation.icosphere(level)
+    return tr.TriangleMesh(torch.tensor(mesh.vertices.tolist()), torch.tensor(mesh.faces.tolist()))
 
 
 def spine_scene():
@@ -39,11 +39,11 @@ def spine_scene():
     curves = torch.stack([still, still + torch.tensor([0.0, 0, 0.3])])
     graph, radii = torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.full((2, 3, 8), 0.1)
     frames, yes = torch.eye(3).expand(2, 3, 8, 3, 3), torch.ones(2, 3, dtype=torch.bool)
-    spine = SpineSequence(
-        Spine(curves, graph, radii), graph, curves, radii, frames, torch.arange(2.0), yes, yes, 0, ("(()()())",) * 2,
-        ("(()()())",) * 2, (Status.CONVERGED,) * 2, Status.CONVERGED, (),
+    spine = tr.SpineSequence(
+        tr.Spine(curves, graph, radii), graph, curves, radii, frames, torch.arange(2.0), yes, yes, 0, ("(()()())",) * 2,
+        ("(()()())",) * 2, (tr.Status.CONVERGED,) * 2, tr.Status.CONVERGED, (),
     )  # fmt: skip
-    return result_scene(spine, data=[unit_sphere(2), unit_sphere(3)])
+    return result_scene(spine, data=[ball(2), ball(3)])
 
 
 def drawn(page):

@@ -18,10 +18,10 @@ from torchreg.alignment.align_stages import (
     DataOnShape,
     anneal_batch,
     best_start,
+    continue_unconverged,
     fit_batch_surface,
-    fit_to_the_end,
-    keep_searched,
-    refit_without_cut,
+    prefer_start_fit,
+    refit_uncropped,
     search_where_needed,
 )
 from torchreg.alignment.annealed_em import OnStep, StageResult
@@ -41,13 +41,7 @@ from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.observability import dof_confidence
 from torchreg.alignment.person_gradient import person_with_gradients
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.problem import (
-    AlignProblem,
-    alignment_cost,
-    centered_problem,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
 from torchreg.alignment.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
@@ -55,6 +49,7 @@ from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.far_origin import to_local, to_world
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -166,24 +161,25 @@ def align(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
                 keypoint_std=keypoint_std, fit_shape=fit_shape, initializer=initializer, config=config, on_step=on_step,
             ),
-            partial(source.glance, skin),
+            partial(source.crop_score, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
+    origin = floating_origin(shape, seen.points)
+    seen, known = to_local(seen, origin), to_local(known, origin)
+    start = initial_pose if origin is None or initial_pose is None else to_local(torch.as_tensor(initial_pose), origin)
+    on_local_step = on_step if origin is None or on_step is None else partial(_in_world, on_step, origin)
     if fit_shape is not False:
         if initializer is not None:
             raise InputError("initializer has no meaning with fit_shape; people are sought without one")
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
-        found = _align_person(shape, seen, initial_pose, config, on_step)
-        person = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
-        return replace(found, shape=person)
-    origin = floating_origin(shape, seen.points)
-    if origin is not None:
-        found = _align_about(origin, shape, seen, initial_pose, model_points, known, source, config, on_step)
+        found = _align_person(shape, seen, start, config, on_local_step)
+        shape = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
     else:
-        found = _align(shape, seen, initial_pose, model_points, known, source, config, on_step)
-    return replace(found, shape=shape)
+        points = to_local(model_points, origin) if isinstance(model_points, Tensor) else model_points
+        found = _align(shape, seen, start, points, known, source, config, on_local_step)
+    return replace(to_world(found, origin), shape=shape)
 
 
 def _align(
@@ -196,7 +192,7 @@ def _align(
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
-    """Return the alignment to what was seen not far from the origin of coordinates."""
+    """Return the alignment to data near the origin."""
     lead, seen = None, seen.drawn(shape, config.nan_policy, config.seed)
     if initial_pose is None and known is not None and known.places_base:
         initial_pose = known.start(shape)
@@ -210,35 +206,26 @@ def _align(
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
         batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen)
         if known is not None:
-            batch = replace(batch, problem=known.applied(batch.problem, batch.start))
+            batch = replace(batch, problem=known.with_prior(batch.problem, batch.start))
         warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
         warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=3)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
             found = anneal_batch(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
             found = fit_batch_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
             batch, found = best_start(batch, found) if several else (batch, found)
-            found = found if lead is None else keep_searched(batch, found, config)
+            found = found if lead is None else prefer_start_fit(batch, found, config)
             found = search_where_needed(batch, found, config)
-            judged = without_cut(batch.problem, found.pose, seen.frames)
-            found = refit_without_cut(batch, judged, found, config)
-            found = fit_to_the_end(batch, judged, found, config)
-        result = _result(batch, found, config, lead, judged, seen)  # inliers by eq. 2, the posterior by eq. 17
+            uncropped = without_cut(batch.problem, found.pose, seen.frames)
+            found = refit_uncropped(batch, uncropped, found, config)
+            found = continue_unconverged(batch, uncropped, found, config)
+        result = _result(batch, found, config, lead, uncropped, seen)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
 def _align_person(
-    shape: ArticulatedShape,
-    seen: Observation,
-    initial_pose: Tensor | None,
-    config: AlignConfig,
-    on_step: OnStep | None,
+    shape: ArticulatedShape, seen: Observation, initial_pose: Tensor | None, config: AlignConfig, on_step: OnStep | None
 ) -> AlignResult:
     """Return the alignment of a rig whose coefficients are fitted together with its pose."""
-    origin = floating_origin(shape, seen.points)
-    if origin is not None:
-        start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
-        told = None if on_step is None else partial(_tell_moved, on_step, origin)
-        return _align_person(shape, seen.near(origin), start, config, told).moved(origin)
     by_data = torch.is_grad_enabled() and isinstance(seen.points, Tensor) and seen.points.requires_grad
     seen = seen if by_data else seen.drawn(shape, config.nan_policy, config.seed)
     with torch.inference_mode():
@@ -284,28 +271,9 @@ class _History:
             self._on_step(step)
 
 
-def _align_about(
-    origin: Tensor,
-    shape: ArticulatedShape,
-    seen: Observation,
-    initial_pose: Tensor | None,
-    model_points: Tensor | LinearBlendSkin | None,
-    known: KnownDofs | None,
-    source: StartSource,
-    config: AlignConfig,
-    on_step: OnStep | None,
-) -> AlignResult:
-    """Return the alignment to data far from the origin of coordinates, computed about an origin (3,) near them."""
-    told = None if on_step is None else partial(_tell_moved, on_step, origin)
-    start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
-    points = model_points - origin if isinstance(model_points, Tensor) else model_points
-    known = None if known is None else known.near(origin)
-    return _align(shape, seen.near(origin), start, points, known, source, config, told).moved(origin)
-
-
-def _tell_moved(on_step: OnStep, origin: Tensor, step: AlignRecord) -> None:
-    """Pass a record on in coordinates that begin where an origin (3,) is given."""
-    on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
+def _in_world(on_step: OnStep, origin: Tensor | None, step: AlignRecord) -> None:
+    """Pass a record on whose coordinates begin at an origin (3,)."""
+    on_step(replace(step, pose=to_world(step.pose, origin)))
 
 
 def _found_pose(
@@ -380,7 +348,7 @@ def _result(
     found: StageResult,
     config: AlignConfig,
     lead: Tensor | None,
-    judged: AlignProblem,
+    uncropped: AlignProblem,
     seen: Observation,
     error: SurfaceError | None = None,
 ) -> AlignResult:
@@ -393,7 +361,7 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    judgement = judge(judged, pose, lead, error, seen.frames)
+    judgement = judge(uncropped, pose, lead, error, seen.frames)
     confidence = torch.where(degenerate, 0.0, judgement.confidence)
     converged = found.change <= config.pose_atol
     converged = converged | judgement.converged if config.surface_steps or error is not None else converged

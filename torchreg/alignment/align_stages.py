@@ -25,15 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AlignBatch:
-    """Alignments in centered coordinates.
-
-    Args:
-        problem: of B clouds.
-        start: (B, num_dofs).
-        origin: (B, 3) of the coordinates.
-        on_step: the caller's.
-        history: records of all stages, to which those of any rows are added.
-    """
+    """B alignments in centered coordinates: starts (B, num_dofs), origins (B, 3), and the records of all stages."""
 
     problem: AlignProblem
     start: Tensor
@@ -101,18 +93,15 @@ def anneal_batch(batch: AlignBatch, config: AlignConfig) -> StageResult:
 
 
 def fit_batch_surface(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the poses after a surface fit; sigma stays that of the registration, at which the posterior is told."""
+    """Return the poses after a surface fit; sigma stays that of the registration, of the posterior."""
     if config.surface_steps == 0:
         return found
     fitted = fit_surface(batch.problem, found.pose, steps=config.surface_steps, on_step=batch.record)
     return replace(fitted, sigma=found.sigma)
 
 
-def keep_searched(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the result, or the start on the surface where that is better: a pose that was searched for needs no EM.
-
-    Data of one side draw an EM, whose kernel is wide at first, into the shape.
-    """
+def prefer_start_fit(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the result, or the fitted start where that is better: an EM may draw one-sided data inwards."""
     if config.surface_steps == 0:
         return found
     steps, widths = max(config.surface_steps, SURFACE_FIT.search_steps), SURFACE_FIT.widths[-1:]
@@ -154,24 +143,26 @@ def search_where_needed(batch: AlignBatch, found: StageResult, config: AlignConf
     return replace(found, pose=pose, change=change)
 
 
-def refit_without_cut(batch: AlignBatch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+def refit_uncropped(batch: AlignBatch, uncropped: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
     """Return the poses fitted without what a crop cuts off, as a forearm, where there is any."""
-    if config.surface_steps == 0 or bool((judged.valid == batch.problem.valid).all()):
+    if config.surface_steps == 0 or bool((uncropped.valid == batch.problem.valid).all()):
         return found
     steps = max(config.surface_steps, SURFACE_FIT.search_steps)
-    refined = fit_surface(judged, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
+    refined = fit_surface(uncropped, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
     return replace(refined, sigma=found.sigma)
 
 
-def fit_to_the_end(batch: AlignBatch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+def continue_unconverged(
+    batch: AlignBatch, uncropped: AlignProblem, found: StageResult, config: AlignConfig
+) -> StageResult:
     """Return the poses after more steps of the last fit, where another would still gain; not of a plain descent."""
     if config.surface_steps == 0 or config.search == "never":
         return found
     rows = (found.change > config.pose_atol).nonzero()[:, 0]
-    rows = rows[~curvature(judged.rows(rows), found.pose[rows]).converged] if len(rows) else rows
+    rows = rows[~curvature(uncropped.rows(rows), found.pose[rows]).converged] if len(rows) else rows
     if len(rows) == 0:
         return found
-    part, start = judged.rows(rows), found.pose[rows]
+    part, start = uncropped.rows(rows), found.pose[rows]
     record = batch.rows(rows).record
     refined = fit_surface(part, start, steps=SURFACE_FIT.more_steps, widths=(), on_step=record)
     pose, change = found.pose.clone(), found.change.clone()

@@ -48,13 +48,7 @@ ANNEALING = Annealing()
 
 @dataclass(frozen=True)
 class StageResult:
-    """Poses at the end of a stage.
-
-    Args:
-        pose: (B, num_dofs).
-        sigma: (B,) last kernel width, metres.
-        change: (B,) of the last step.
-    """
+    """Poses (B, num_dofs) at the end of a stage, the last kernel widths (B,) in metres, and the last changes (B,)."""
 
     pose: Tensor
     sigma: Tensor
@@ -74,20 +68,10 @@ def anneal(
     m_steps: int,
     on_step: OnStep | None = None,
 ) -> StageResult:
-    """Return the pose after annealed EM: E-step (17, 18), M-step (20), a smaller sigma, and again.
+    """Return the pose (B, num_dofs) after annealed EM: E-step (17, 18), M-step (20), a smaller sigma, and again.
 
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs) to start from.
-        schedule: of sigma.
-        em_steps: EM iterations per sigma, at most; fewer when no pose changes any more.
-        m_steps: Levenberg-Marquardt steps per M-step; a single one is taken without testing it (generalized EM).
-        on_step: called after each iteration.
-
-    Returns:
-        a `StageResult`.
-
-    References: Dewaele et al. 2006, sections 3.2 and 3.3.
+    At most `em_steps` per sigma; a single M-step is taken without a test (generalized EM). Dewaele et al. 2006,
+    3.2-3.3.
     """
     adaptive = schedule.kind == "adaptive"
     if adaptive:
@@ -133,20 +117,15 @@ def _match(problem: AlignProblem, rows: Tensor, posed: Tensor, sigma: Tensor) ->
 
 
 def _debiased(matches: EStep, posed: Tensor, self_matches: EStep, share: float) -> EStep:
-    """Return the E-step with a share of the shrinkage by the kernel alone taken out of its targets.
+    """Return the E-step whose targets are corrected by a share of the kernel's shrinkage, that of the model on itself.
 
-    A wide kernel draws every point towards the mean of its surroundings even in the true pose, which shrinks and bends
-    the model. The model registered to itself shows that bias, ``S_i - X_i``; a share of it is subtracted from
-    ``G_i - X_i``. It is only a share because hidden model points have no counterpart in the data.
+    It is only a share because hidden model points have no counterpart in the data.
     """
     return replace(matches, targets=matches.targets + share * (posed - self_matches.targets))
 
 
 def _tempered_prior(problem: AlignProblem, matches: EStep) -> GaussianPosePrior:
-    """Return the prior weighed against residuals that are not independent while the kernel is wide.
-
-    It counts as many times as model points share a datum: n, which follows from the inlier posterior n / (n + c).
-    """
+    """Return the prior times the model points that share a datum, n of the inlier posterior n / (n + c)."""
     if problem.correspondence != "em":
         return problem.prior
     posterior = matches.inlier_posterior.clamp_max(ANNEALING.max_posterior)

@@ -37,7 +37,7 @@ class BaseFitNumbers:
     depth_std: float = 0.02  # by which all measured surfaces may lie off the true ones, along their normals
     offset_std: float = 0.05  # of a joint's offset about zero, radians: three degrees
     slide_std: float = 0.01  # the same of joints that slide
-    told: float = 0.3  # of that, which may be left of an offset that the data tell
+    max_posterior_to_prior_std: float = 0.3  # of an offset that the data determine
     space_share: float = 0.25  # of its area that a surface shows from a direction, on average (Cauchy)
 
 
@@ -48,18 +48,10 @@ _DEPTH, _OFFSETS = BASE_DOFS, BASE_DOFS + 1
 
 @dataclass(frozen=True, eq=False)
 class BaseProblem:
-    """All frames of a calibration, and what is fitted to them.
+    """All frames of a calibration. A state (1, 7 + J) is the base, a depth offset in metres, and the joints' offsets.
 
-    A state (1, 7 + J) is the base (translation, rotation vector), the distance by which all data lie outside of the
-    surface, metres, and the offsets of the joints.
-
-    Args:
-        frames: of one base.
-        shares: of each frame's data that are independent.
-        surface: of the robot.
-        skin: points that should not lie in free space.
-        size: of the robot, metres.
-        free: (J,) True for joints with an offset.
+    The base is a translation and a rotation vector; `shares` are the independent parts of each frame's data; `free`
+    (J,) is True for joints with an offset.
     """
 
     frames: tuple[BaseFrame, ...]
@@ -113,23 +105,13 @@ class BaseProblem:
         return [row[kept] for row, kept in zip(distance, valid, strict=True)]
 
     def facing(self, state: Tensor) -> Tensor:
-        """Return which data (T, M) lie on surfaces that face the camera.
-
-        Along an outline the nearest surface may be one that is turned away, which the camera cannot have measured.
-        """
+        """Return which data (T, M) lie on surfaces that face the camera, the only ones that it can have measured."""
         points, valid = self.data
         jacobian = self.surface.distance_jacobian(points, self.poses(state))[1]
         return ((jacobian[..., :3] * points).sum(-1) > 0) & valid
 
     def linearize(self, state: Tensor, seen: Tensor, sigma: float, noise: float) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian of the data that are ``seen`` (T, M).
-
-        Args:
-            state: (1, 7 + J).
-            seen: of `facing`.
-            sigma: width of the Welsch kernel, metres.
-            noise: standard deviation of the data, metres.
-        """
+        """Return cost, gradient and Gauss-Newton Hessian of the data ``seen`` (T, M); sigma and noise in metres."""
         prior = self.precision()
         cost, gradient, hessian = 0.5 * (prior * state[0].square()).sum(), prior * state[0], torch.diag(prior)
         for residual, jacobian, weight in self._terms(state, seen):
@@ -172,15 +154,7 @@ def _with_depth(jacobian: Tensor, by_depth: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class BaseFit:
-    """A base fitted to frames.
-
-    Args:
-        problem: what was fitted.
-        state: (1, 7 + J).
-        sigma: width of the last kernel, metres.
-        noise: robust standard deviation of the residuals, metres.
-        converged: whether the last step was small.
-    """
+    """A state (1, 7 + J) fitted to frames, the last kernel's width and the robust noise of the residuals, metres."""
 
     problem: BaseProblem
     state: Tensor
@@ -258,10 +232,7 @@ def _inverse(hessian: Tensor) -> Tensor:
 
 
 def fit_offsets(fit: BaseFit) -> BaseFit:
-    """Return a fit with offsets of those joints whose offsets the data tell.
-
-    The one that they tell least is held at zero again and again: an offset of the first joint turns the base alone.
-    """
+    """Return a fit with offsets of the joints that the data determine; the least determined is locked in turn."""
     problem = replace(fit.problem, free=torch.ones_like(fit.problem.free))
     found = fit_base(problem, fit.state, widths=())
     prior, hessian = problem.precision()[_OFFSETS:].rsqrt(), found.linearization().hessian[0]
@@ -270,7 +241,7 @@ def fit_offsets(fit: BaseFit) -> BaseFit:
         kept = torch.cat([torch.ones(_OFFSETS, dtype=torch.bool), free])
         std = _inverse(hessian.masked_fill(~kept | ~kept.unsqueeze(-1), 0.0)).diagonal()[_OFFSETS:].sqrt()
         worst = int(torch.where(free, std / prior, 0.0).argmax())
-        if float(std[worst]) <= BASE_FIT.told * float(prior[worst]):
+        if float(std[worst]) <= BASE_FIT.max_posterior_to_prior_std * float(prior[worst]):
             break
         free[worst] = False
     state = fit.state.clone()

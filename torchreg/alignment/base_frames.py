@@ -37,13 +37,7 @@ _GIVEN = _Given()
 
 @dataclass(frozen=True, eq=False)
 class BaseFrame:
-    """A frame of a calibration.
-
-    Args:
-        points: (M, 3) float64, in camera coordinates, metres: spread over all that were given.
-        joints: (J,) float64, metres and radians.
-        free_space: what the picture says of where nothing is, in camera coordinates; None for clouds.
-    """
+    """Points (M, 3) in camera coordinates, metres, joints (J,), and the free space of a depth picture, if any."""
 
     points: Tensor
     joints: Tensor
@@ -66,17 +60,7 @@ def _spread(points: Tensor, count: int) -> Tensor:
 
 
 def read_frames(shape: Articulation, frames: Any, poses: Any) -> list[BaseFrame]:
-    """Return the frames of a calibration, checked.
-
-    Args:
-        shape: whose joints are given.
-        frames: T clouds (M, 3), as a sequence or as one tensor, or depth frames.
-        poses: see `calibrate_base`.
-
-    Raises:
-        InputError: if there is no frame, one is empty or not finite, or the joints do not fit.
-        InputTypeError: if something is no cloud.
-    """
+    """Return the checked frames of a calibration from T clouds (M, 3) or depth frames and their joints."""
     given = list(frames) if isinstance(frames, (Sequence, Tensor)) else [frames]
     if not given:
         raise InputError("frames must hold at least one cloud or depth frame, got none")
@@ -101,10 +85,7 @@ def _read_frame(frame: Any, joints: Tensor, number: int) -> BaseFrame:
 
 
 def _beside_mask(frame: DepthFrame) -> FreeSpace | None:
-    """Return the free space beside a frame's mask, in camera coordinates; None without a mask.
-
-    Within the mask the data themselves tell where the surface is: noise on one side would push it back.
-    """
+    """Return the free space outside a frame's mask, in camera coordinates; None without a mask."""
     if frame.mask is None:
         return None
     given = frame.camera
@@ -114,17 +95,7 @@ def _beside_mask(frame: DepthFrame) -> FreeSpace | None:
 
 
 def read_joints(shape: Articulation, poses: Any, count: int) -> Tensor:
-    """Return the joints (T, J), float64, of ``count`` frames within the shape's limits.
-
-    Args:
-        shape: whose joints they are.
-        poses: (T, J) in the order of the shape's joints, (T, num_dofs), or T dictionaries by name of joint.
-        count: T.
-
-    Raises:
-        InputError: if sizes or names do not fit, a number is not finite or lies beyond a limit.
-        InputTypeError: if they are something else.
-    """
+    """Return the joints (T, J), float64, within limits, of (T, J), (T, num_dofs) or T dictionaries by name."""
     names = shape.dof_names[BASE_DOFS:]
     if isinstance(poses, Sequence) and poses and isinstance(poses[0], Mapping):
         rows = torch.tensor([_by_name(row, names, number) for number, row in enumerate(poses)], dtype=torch.float64)

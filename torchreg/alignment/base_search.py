@@ -41,13 +41,7 @@ _SEARCH = _BaseSearch()
 
 @dataclass(frozen=True, eq=False)
 class PosedModel:
-    """The robot in the joints of a frame, in base coordinates.
-
-    Args:
-        points: (N, 3) of its surface.
-        normals: (N, 3) outwards.
-        tree: of the points.
-    """
+    """The robot in the joints of a frame, in base coordinates: points and outward normals (N, 3)."""
 
     points: Tensor
     normals: Tensor
@@ -62,16 +56,10 @@ class PosedModel:
 
 
 def search_base(frames: Sequence[BaseFrame], models: Sequence[PosedModel], size: float) -> tuple[Tensor, Tensor]:
-    """Return candidates (K, 4, 4) ``T_camera_base``, different ones, best first, and their costs (K,).
+    """Return different candidates (K, 4, 4) ``T_camera_base``, best first, and their costs (K,).
 
-    Rotations from all around, each with the base where the seen sides of the models lie on the clouds; then iterated
-    closest points with a kernel that narrows, over all frames together, of ever fewer candidates. Costs count data far
-    from the model, and model points that face the camera where nothing was seen.
-
-    Args:
-        frames: T clouds.
-        models: T models of the robot in the frames' joints.
-        size: of the robot, metres.
+    Iterated closest points with a narrowing kernel from rotations all around. Costs count data far from the model, and
+    model points that face the camera where nothing was measured.
     """
     data = _drawn(frames)
     candidates = _starts(data, models)
@@ -139,7 +127,7 @@ def _step(candidates: Tensor, data: Tensor, models: Sequence[PosedModel], width:
 def _cost(
     candidates: Tensor, data: Tensor, frames: Sequence[BaseFrame], models: Sequence[PosedModel], size: float
 ) -> Tensor:
-    """Return the costs (K,) of candidates: of data far from the model, and of the model where nothing was seen."""
+    """Return the costs (K,) of candidates: of data far from the model, and of the model where nothing was measured."""
     width = _SEARCH.score_width * size
     far = _step(candidates, data, models, width)[1]
     beside = torch.zeros_like(far)
@@ -154,7 +142,7 @@ def _cost(
 
 
 def _before_data(points: Tensor, posed: Tensor) -> Tensor:
-    """Return how far posed points (K, N, 3) lie before the data (M, 3) in their direction, or beside all of them."""
+    """Return how far posed points (K, N, 3) lie before the data (M, 3) in their direction, or off all of them."""
     plane = points[:, :2] / points[:, 2:].clamp_min(1e-6)
     tree = NeighborTree(plane)
     typical = tree.k_nearest(plane, min(2, len(plane)))[1][:, -1].median()

@@ -59,18 +59,7 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class CalibrateRecord:
-    """One joint fit at one kernel width, as given to ``on_step``.
-
-    Args:
-        round: number of the round.
-        step: number of the fit in the round.
-        num_steps: fits per round.
-        sigma: kernel width, metres.
-        cost: of the fit.
-        poses: (T, num_dofs).
-        log_length_scales: (P,).
-        log_radius_scales: (P,).
-    """
+    """One joint fit at one kernel width, as given to ``on_step``: poses (T, num_dofs), scales (P,), sigma in metres."""
 
     round: int
     step: int
@@ -195,7 +184,7 @@ def _calibrate_person(
     masks: Tensor | None,
     config: CalibrateConfig,
 ) -> Calibration:
-    """Return the person whom frames show: one set of coefficients, and a pose for each frame."""
+    """Return the calibration of one set of coefficients and a pose for each frame."""
     with torch.inference_mode():
         data, valid = _check_frames(shape, frames, masks, config.align.nan_policy)
         frame_poses = FramePoses.of(_check_poses(shape, initial_poses, len(data)), initial_poses is None)

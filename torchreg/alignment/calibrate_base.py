@@ -50,10 +50,7 @@ _NUMBERS = _Numbers()
 
 
 def calibrate_base(
-    shape: ArticulatedShape,
-    frames: Sequence[Tensor | DepthFrame] | Tensor,
-    poses: Any,
-    offsets: bool = False,
+    shape: ArticulatedShape, frames: Sequence[Tensor | DepthFrame] | Tensor, poses: Any, offsets: bool = False
 ) -> BaseCalibration:
     """Return where a robot's base is in a camera's coordinates, from one or more frames with known joints.
 

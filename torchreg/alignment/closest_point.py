@@ -21,27 +21,10 @@ def closest_point(
     *,
     mask: Tensor | None = None,
 ) -> EStep:
-    """Return the matches of an articulated ICP in the form of an E-step: one vote of each datum, or none.
+    """Return the matches of an articulated ICP as an E-step: each datum votes for its closest model point or for none.
 
-    Each datum belongs to its closest model point alone, with probability one, unless that lies farther away than
-    1.5 sigma; then it is an outlier. The trimming distance shrinks with the schedule of sigma.
-
-    Args:
-        model: (..., N, 3) posed model points, metres.
-        data: (..., M, 3), metres, with batch dimensions that broadcast with the model's.
-        sigma: (...) metres, positive.
-        outlier: not used, as the trimming distance takes its place; all E-steps are called alike.
-        mask: (..., M) False where a datum is padding, whose coordinates are never looked at.
-
-    Returns:
-        an `EStep`: the number of data of each model point, their mean, 0 or 1 for each datum, and the sum of squared
-        distances of all matches.
-
-    Differentiable: no.
-
-    Cost: O(N M) time, bounded memory.
-
-    References: Besl and McKay 1992; Zhang 1994 for the trimming distance.
+    It is an outlier beyond 1.5 sigma; ``outlier`` is not used, as all E-steps are called alike. Model (..., N, 3), data
+    (..., M, 3) and sigma (...) in metres, mask (..., M). Besl and McKay 1992; Zhang 1994.
     """
     batch = torch.broadcast_shapes(model.shape[:-2], data.shape[:-2])
     flat, num_model, num_data = math.prod(batch), model.shape[-2], data.shape[-2]

@@ -1,4 +1,4 @@
-"""The confidence in poses found without a start: rivals, data left beside the surface, limbs that no data show."""
+"""The confidence in poses found without a start: rivals, near outliers, limbs without data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class _Misfit:
-    """Thresholds of a misfit: too many data beside the surface, so near that outliers are rare."""
+    """Thresholds of a misfit: too many near outliers."""
 
     reach: float = 0.05  # of data beside the surface, at most, as a share of the model's size
     share: float = 0.025  # of the data: more are a misfit
@@ -40,66 +40,48 @@ _MISFIT = _Misfit()
 
 
 @dataclass(frozen=True, eq=False)
-class DataOnSurface:
-    """How the data lie on the surface in some poses.
-
-    Args:
-        distance: (B, M) of the data from it, metres.
-        jacobian: (B, M, num_dofs) of the distances.
-        limb_data: (B, L) number of data that only one limb explains, see `limb_data`.
-    """
+class SurfaceResiduals:
+    """Distances (B, M) of data from the surface in some poses, metres, their Jacobian, and `limb_data` (B, L)."""
 
     distance: Tensor
     jacobian: Tensor
     limb_data: Tensor
 
     @classmethod
-    def of(cls, problem: AlignProblem, pose: Tensor) -> DataOnSurface:
+    def of(cls, problem: AlignProblem, pose: Tensor) -> SurfaceResiduals:
         """Return how the data of a batch lie in poses (B, num_dofs)."""
         return cls(*problem.surface.distance_jacobian(problem.data, pose), limb_data(problem, pose))
 
 
 def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
-    """Return the confidence (B,) in poses, from 0 to 1.
-
-    It is low if a different pose explains nearly as many data, if data lie beside the surface or in dense clusters, or
-    if the data do not determine where the limbs end.
-
-    Args:
-        problem: the batch; its prior holds joints that no data show.
-        pose: (B, num_dofs), fitted.
-        lead: (B,) by how many data more than the best of different poses it explains.
-    """
+    """Return the confidence (B,) in fitted poses from the ``lead`` over rivals, misfit, clusters and limbs' ends."""
     return explains(problem, pose, lead) * known_ends(problem, pose)
 
 
 def explains(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
-    """Return the same (B,) but for what no data determine, which no search would find either."""
+    """Return the confidence (B,) without the observability factor, which no search would improve."""
     left = left_over(problem, pose)
     return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left / EVIDENCE.left_over).exp()
 
 
 def left_over(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return how many data (B,) lie beside the surface or in dense clusters, as a share of those on it."""
+    """Return the near outliers and data in dense clusters (B,), as a share of the data on the surface."""
     clustered, near = clustered_data(problem, pose)
-    return clustered.to(pose) / near.clamp_min(1) + beside_share(problem, pose)
+    return clustered.to(pose) / near.clamp_min(1) + near_outlier_share(
+        problem, problem.surface.distance(problem.data, pose)
+    )
 
 
 def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return a mask (B,) of poses that leave too many data beside the surface: outliers are spread more thinly.
-
-    The noise is left out, since a wrong pose makes it look larger than it is: noisy data are misfits, too.
-    """
-    return beside_share(problem, pose, OffSurface(noises=0.0)) > _MISFIT.share
-
-
-def beside_share(problem: AlignProblem, pose: Tensor, off: OffSurface = OFF_SURFACE) -> Tensor:
-    """Return the share (B,) of the data that lie beside the surface: off it, but not far."""
-    return share_beside(problem, problem.surface.distance(problem.data, pose), off)
+    """Return a mask (B,) of poses that leave too many data near the surface; outliers are spread more thinly."""
+    return (
+        near_outlier_share(problem, problem.surface.distance(problem.data, pose), OffSurface(noises=0.0))
+        > _MISFIT.share
+    )
 
 
-def share_beside(problem: AlignProblem, distance: Tensor, off: OffSurface = OFF_SURFACE) -> Tensor:
-    """Return the same for data at distances (B, M) from the surface."""
+def near_outlier_share(problem: AlignProblem, distance: Tensor, off: OffSurface = OFF_SURFACE) -> Tensor:
+    """Return the share (B,) of data at distances (B, M) that lie off the surface, but not far."""
     noise = surface_noise(distance, problem.valid, problem.size)
     beyond = off.distance(noise, problem.size).unsqueeze(-1)
     beside = (distance.abs() > beyond) & (distance.abs() < _MISFIT.reach * problem.size) & problem.valid
@@ -107,38 +89,25 @@ def share_beside(problem: AlignProblem, distance: Tensor, off: OffSurface = OFF_
 
 
 def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the probability (B,) that the limbs end where poses (B, num_dofs) have them.
-
-    The mean of the ends' spreads is taken for that of a Rayleigh distribution's squares, of which a share lies within
-    the tolerance.
-    """
+    """Return the probability (B,), by Rayleigh's distribution, that the ends of limbs lie within the tolerance."""
     spread = end_spreads(problem, pose).mean(-1)
     return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
 
 
-def end_spreads(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Tensor:
-    """Return by how much the ends (B, L) of the limbs may be off in poses (B, num_dofs), metres.
-
-    The position of an end spreads by the covariance of the pose, given the data near the surface and the prior; that of
-    a limb which explains no data alone spreads by the prior.
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        lying: how its data lie in these poses, where that is known.
-    """
+def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Tensor:
+    """Return the deviations (B, L) of the limbs' ends, metres; a limb without data of its own spreads by the prior."""
     if problem.data.shape[-2] > EVIDENCE.num_data:
-        problem, lying = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None
-    lying = lying or DataOnSurface.of(problem, pose)
+        problem, residuals = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None
+    residuals = residuals or SurfaceResiduals.of(problem, pose)
     moves = end_motions(problem.skin, pose, limb_ends(problem.skin))
     # What the prior leaves free is plausible, at least.
     prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
     variances = prior.reciprocal()
     variances[..., :BASE_DOFS] = 0
     loose = (moves.square() * variances[..., None, None, :]).sum((-2, -1))
-    covariance = _covariance(problem, pose, lying, prior)
+    covariance = _covariance(problem, pose, residuals, prior)
     fitted = end_variances(moves, covariance)
-    alone = (-lying.limb_data / EVIDENCE.limb_data).exp()
+    alone = (-residuals.limb_data / EVIDENCE.limb_data).exp()
     return (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
 
 
@@ -173,12 +142,12 @@ def limb_points(skin: LinearBlendSkin) -> list[tuple[Limb, Tensor]]:
     return [(limb, index) for limb, index in points if len(index)]
 
 
-def _covariance(problem: AlignProblem, pose: Tensor, lying: DataOnSurface, precision: Tensor) -> Tensor:
+def _covariance(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals, precision: Tensor) -> Tensor:
     """Return the covariance (B, num_dofs, num_dofs) of poses, given near data and a prior's precision."""
-    noise = surface_noise(lying.distance, problem.valid, problem.size)
+    noise = surface_noise(residuals.distance, problem.valid, problem.size)
     width = SURFACE_FIT.width_per_noise * noise
-    near = welsch_weight((lying.distance / width.unsqueeze(-1)).square()) * problem.valid
-    covariance = pose_covariance(lying.jacobian, near, noise, precision)
+    near = welsch_weight((residuals.distance / width.unsqueeze(-1)).square()) * problem.valid
+    covariance = pose_covariance(residuals.jacobian, near, noise, precision)
     return covariance if problem.landmarks is None else problem.landmarks.informed(covariance, pose)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.confidence import DataOnSurface, limb_points
+from torchreg.alignment.confidence import SurfaceResiduals, limb_points
 from torchreg.alignment.observability import plausible_variance
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import AlignProblem
@@ -35,13 +35,9 @@ _ERRORS = _Errors()
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """The objective around fitted poses.
+    """Covariance (B, D, D) in tangent coordinates, gain (B,) of another step in log-likelihood, noise (B,) in metres.
 
-    Args:
-        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
-        gain: (B,) log-likelihood that a further step would gain.
-        noise: (B,) of the data, metres.
-        shared: (B,) number of data that err together.
+    `shared` (B,) is the number of data that err together.
     """
 
     covariance: Tensor
@@ -55,21 +51,14 @@ class Curvature:
         return self.gain <= _ERRORS.gain
 
 
-def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Curvature:
+def curvature(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Curvature:
     """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
 
-    Neighboring data err together: the correlation of their residuals says how many of them count as one. Beside noise,
-    a patch of the surface errs by what the model is not exact, and of solids so does the whole surface; their
-    proportions may be wrong, too. One datum or two tell nothing surely. What no data tell is as uncertain as the
-    joints' limits leave it, and so is a limb that hardly any data show.
-
-    Args:
-        problem: the batch.
-        pose: fitted.
-        lying: how its data lie in these poses, where that is known.
+    Correlated residuals, model errors per patch, wrong proportions, and chance hits of single data are included.
+    Unobserved directions get the variance of the joint limits.
     """
-    lying = lying or DataOnSurface.of(problem, pose)
-    distance, jacobian = lying.distance, lying.jacobian
+    residuals = residuals or SurfaceResiduals.of(problem, pose)
+    distance, jacobian = residuals.distance, residuals.jacobian
     noise = surface_noise(distance, problem.valid, problem.size)
     sigma = SURFACE_FIT.width_per_noise * noise
     near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
@@ -77,7 +66,7 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
     inexact = (SURFACE_FIT.min_noise(problem.size) / noise).square() * near.sum(-1) / patches
     correlation = neighbor_correlation(problem.data, distance, near)
     shared = correlated_count(correlation) + inexact
-    if problem.told_precision is not None:
+    if problem.prior_precision is not None:
         # As the fit weighed the data against what was told.
         shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
     precision = plausible_precision(problem, pose)
@@ -86,7 +75,7 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
     if problem.landmarks is not None:
         fitted, covariance = (problem.landmarks.informed(each, pose) for each in (fitted, covariance))
     gain = _gain(problem, pose, distance, jacobian, noise, fitted) / shared.square()
-    if problem.told_precision is not None:
+    if problem.prior_precision is not None:
         # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
         error = surface_noise(distance, problem.valid, problem.size, clamped=False)
         # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
@@ -97,19 +86,15 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
-    misplaced = torch.diag_embed(_misplaced_share(problem, lying.limb_data) / precision)
+    misplaced = torch.diag_embed(_misplaced_share(problem, residuals.limb_data) / precision)
     return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, noise, shared)
 
 
 def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
-    """Return the covariance of `pose_covariance` by what the data surely tell, not one of them or two by chance.
+    """Return the covariance of `pose_covariance` by a lower confidence limit of the data's information.
 
-    What they tell of a direction, in units of what is known without them, is a sum over the data, whose standard
-    deviation, if others of their kind had been measured, is the root of the sum of squares: the lower end is taken. A
-    few outliers on the surface seem to tell of turns that a round part does not show; of what hundreds tell it takes a
-    tenth.
-
-    References: Efron 1979, the variance of a sum over resampled data.
+    The standard deviation of a sum over the data is the root of its sum of squares (Efron 1979), so that one or two
+    data by chance determine no direction.
     """
     known = precision.double().rsqrt()
     rows = (jacobian * (weights.sqrt() / noise.unsqueeze(-1)).unsqueeze(-1)).double() * known.unsqueeze(-2)
@@ -120,17 +105,9 @@ def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision
 
 
 def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:
-    """Return the covariance of a fit whose data err more than it assumed, by the sandwich of its own weights.
+    """Return the sandwich covariance ``F (e A + P) F``, ``F = (A + P)^-1``, of data with e times the variance assumed.
 
-    The fit's estimate has the covariance ``F (e A + P) F`` where ``F = (A + P)^-1``: A is what it took the data to
-    tell, P what was told, and e by how much the data's variance is larger, at least one.
-
-    Args:
-        covariance: (B, D, D) F.
-        precision: (B, D) diagonal of P.
-        excess: (B,) e.
-
-    References: Huber 1967; White 1982.
+    F is ``covariance`` (B, D, D), P ``precision`` (B, D), e ``excess`` (B,). Huber 1967; White 1982.
     """
     by_data = covariance - (covariance * precision.to(covariance).unsqueeze(-2)) @ covariance
     return covariance + (excess.clamp_min(1) - 1)[:, None, None] * by_data
@@ -149,16 +126,7 @@ def _gain(
 def hardly_gains(
     problem: AlignProblem, pose: Tensor, distance: Tensor, jacobian: Tensor, noise: Tensor, covariance: Tensor
 ) -> Tensor:
-    """Return whether another step of the last fit would hardly matter, (B,).
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        distance: (B, M) of the data from the surface.
-        jacobian: (B, M, num_dofs) of the distances.
-        noise: (B,) of the data.
-        covariance: (B, num_dofs, num_dofs), all data counted.
-    """
+    """Return whether another step of the last fit would hardly matter, (B,)."""
     patches = _ERRORS.patches * problem.skin.shape.num_parts
     shared = (problem.valid.sum(-1) / patches).clamp_min(1)
     return _gain(problem, pose, distance, jacobian, noise, covariance) / shared <= _ERRORS.gain
@@ -177,27 +145,17 @@ def plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
     spans = (problem.upper - problem.lower).expand_as(pose)
     plausible = plausible_variance(problem.skin.shape, problem.size, spans).reciprocal()
-    return plausible if problem.told_precision is None else torch.maximum(plausible, problem.told_precision)
+    return plausible if problem.prior_precision is None else torch.maximum(plausible, problem.prior_precision)
 
 
 def correlated_count(correlation: Tensor) -> Tensor:
-    """Return how many data (B,) err as one: the sum of the correlations of a residual with all around it.
-
-    The correlation (B,) of nearest neighbors, taken to fall off as a Gaussian with the distance, is summed over a
-    lattice.
-    """
+    """Return how many data (B,) err as one: the sum over a lattice of correlations that fall off as a Gaussian."""
     step = torch.arange(-_ERRORS.lattice, _ERRORS.lattice + 1).to(correlation)
     return (correlation.unsqueeze(-1) ** step.square()).sum(-1).square()
 
 
 def neighbor_correlation(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
-    """Return the correlation (B,) of the residuals of nearest neighbors, not negative.
-
-    Args:
-        data: (B, M, 3).
-        residual: (B, M) metres.
-        weight: (B, M) of the residuals, from 0 to 1.
-    """
+    """Return the correlation (B,), at least zero, of the residuals (B, M) of nearest neighbors, by weights (B, M)."""
     stride = -(-data.shape[1] // _ERRORS.num_correlated)
     together = []
     for points, errors, shares in zip(data, residual, weight, strict=True):

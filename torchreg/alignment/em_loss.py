@@ -194,8 +194,7 @@ def _check(posed_points: Tensor, data: Tensor, mask: Tensor | None) -> torch.Siz
 class _LogLikelihood(Function):
     """``log(sum_i exp(-|x_i - y_j|^2) + c)`` of points x (B, N, 3), data y (B, M, 3) and c (B,): (B, M).
 
-    Nothing of size N M is kept: each pass computes the kernel again, a chunk of data at a time. Every result is written
-    into one buffer, batched under vmap like all inputs together: a list of small results would fragment the heap.
+    Nothing of size N M is kept: each pass computes the kernel again in chunks, into one buffer for all of a batch.
     """
 
     generate_vmap_rule = True

@@ -12,9 +12,7 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.alignment.annealed_em import ANNEALING, anneal
 from torchreg.alignment.confidence import explains, is_misfit, pose_confidence
-from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
@@ -26,23 +24,18 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
-from torchreg.alignment.limb_search import distinct_first, rows_in_memory, take_rows
+from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.pose_search import SEARCH_BUDGET, PoseSearch, mean_distances
-from torchreg.alignment.problem import (
-    AlignProblem,
-    alignment_cost,
-    centered_problem,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.pose_search import PoseSearch, mean_distances
+from torchreg.alignment.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.start_source import StartSource
-from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.alignment.whole_alignment import align_rows, best_distinct, best_first, fit_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.far_origin import to_local, to_world
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -55,8 +48,6 @@ class _Candidates:
     """Numbers of the candidates; lengths are shares of the model's size."""
 
     typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
-    max_compared: int = 300  # best rough poses, of which different ones are taken
-    same_rough: float = 0.045  # rough poses whose points differ by less are duplicates
     same: float = 0.05  # found poses whose points differ by less are duplicates
     fit_steps: int = 3  # at each width of the coarse fit
     proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
@@ -174,15 +165,12 @@ def find_pose(
             find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
             locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.glance, skin))[0]
+        return surest_crop(data, model_size(skin), search, partial(source.crop_score, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
-    far = floating_origin(shape, seen.points)
-    near = seen if far is None else seen.near(far)
-    known = KnownDofs.of(shape, locked, prior)
-    known = known if known is None or far is None else known.near(far)
-    starts = search_everywhere(shape, near, num_starts, source, model_points, config, known).starts
-    poses = starts.poses if far is None else shifted(starts.poses.double(), far.to(starts.poses.device))
-    return replace(starts, poses=poses, shape=shape)
+    origin = floating_origin(shape, seen.points)
+    seen, known = to_local(seen, origin), to_local(KnownDofs.of(shape, locked, prior), origin)
+    starts = search_everywhere(shape, seen, num_starts, source, model_points, config, known).starts
+    return replace(starts, poses=to_world(starts.poses, origin), shape=shape)
 
 
 def search_everywhere(
@@ -194,7 +182,7 @@ def search_everywhere(
     config: FindPoseConfig,
     known: KnownDofs | None = None,
 ) -> FoundStarts:
-    """Return what `find_pose` finds in what was seen, not far from the origin."""
+    """Return what `find_pose` finds in data near the origin."""
     seen = seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
     with torch.no_grad():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
@@ -208,12 +196,12 @@ def search_everywhere(
             free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
-            problem = known.applied(problem, shifted(known.start(shape).expand_as(typical), -origin))
+            problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
         warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
-            poses, costs = _find(problem, seen.frames, source.informed(known), config)
+            poses, costs = _find(problem, seen.frames, source.with_known(known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
@@ -226,12 +214,7 @@ def search_everywhere(
 
 @dataclass(frozen=True, eq=False)
 class FoundStarts:
-    """Starts, and by how much the first is better than others.
-
-    Args:
-        starts: best first.
-        lead: (B,) cost by which the best of different poses is worse than the first; infinite where there is none.
-    """
+    """Starts, best first, and the cost (B,) by which the best of different poses is worse, or infinity."""
 
     starts: PoseStarts
     lead: Tensor
@@ -240,16 +223,13 @@ class FoundStarts:
 def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
 ) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs), best first, and their costs: a network's, and those of a search if doubtful.
-
-    The search is of no use where all that is doubtful is where limbs end that no data show.
-    """
+    """Return candidates (B, H, num_dofs), best first, and costs: a network's, and a search's if in doubt."""
     problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
-    poses, costs = _fitted(problem, proposed)
-    judged = without_cut(problem, poses[:, 0], frames)
-    sure = explains(judged, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
+    poses, costs = fit_rows(problem, proposed)
+    uncropped = without_cut(problem, poses[:, 0], frames)
+    sure = explains(uncropped, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     first = torch.zeros(len(poses), min(config.num_searched, config.num_placed), dtype=torch.int64, device=poses.device)
@@ -257,7 +237,7 @@ def _find(
     if len(rows):
         found, found_costs = _search_with_retries(problem.rows(rows), source, config, poses[rows])
         searched[rows], searched_costs[rows] = found, found_costs
-    return _best_first(torch.cat([poses, searched], dim=1), torch.cat([costs, searched_costs], dim=1))
+    return best_first(torch.cat([poses, searched], dim=1), torch.cat([costs, searched_costs], dim=1))
 
 
 def _search_with_retries(
@@ -281,65 +261,21 @@ def _search_with_retries(
 def _search(
     problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs) after one search, best first, and their costs.
-
-    Args:
-        problem: the batch.
-        source: of rough poses.
-        config: of the search.
-        proposed: (B, K, num_dofs) that lie on the data already.
-    """
+    """Return candidates (B, H, num_dofs) after one search, best first, and their costs."""
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = source.rough(search.problem, generator)
     rough, rough_costs = register_rigidly(search.problem, rough, generator)
     if isinstance(problem.surface, SkinSurface):
-        rough = _best_distinct(search.problem, rough, rough_costs, config.num_placed)
-        return _fitted(problem, _registered(problem, torch.cat([proposed, rough], dim=1), config, generator))
-    rough = _best_distinct(search.problem, rough, rough_costs, config.num_candidates)
+        rough = best_distinct(search.problem, rough, rough_costs, config.num_placed)
+        return fit_rows(
+            problem, align_rows(problem, torch.cat([proposed, rough], dim=1), config.num_searched, generator)
+        )
+    rough = best_distinct(search.problem, rough, rough_costs, config.num_candidates)
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
     pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
-    return _fitted(problem, poses)
-
-
-def _registered(problem: AlignProblem, poses: Tensor, config: FindPoseConfig, generator: torch.Generator) -> Tensor:
-    """Return the best candidates (B, H, num_dofs) of some (B, K, num_dofs) after an alignment of all their joints.
-
-    The limbs of a skin are not placed one after another: the solids that stand for its parts are too rough for that,
-    and bones of a spine, rather than a trunk that is found first, lie between them.
-    """
-    settings, found, count = AlignConfig(), [], poses.shape[1]
-    drawn = replace(problem.draw(SEARCH_BUDGET.num_data, generator), debias=settings.debias)
-    schedule, shape = ANNEALING.schedule(problem.size), problem.skin.shape
-    derivatives = count * shape.num_parts * problem.skin.basis.shape[-1] * shape.num_dofs
-    for rows in rows_in_memory(len(poses), derivatives, poses.device):
-        part, pose = drawn.rows(rows).repeated(count), poses[rows].flatten(0, 1)
-        pose = anneal(part, pose, schedule, em_steps=settings.em_steps, m_steps=settings.m_steps).pose
-        pose = fit_surface(part, pose, steps=settings.surface_steps).pose
-        costs = alignment_cost(part, pose).unflatten(0, (-1, count))
-        found.append(_best_distinct(drawn.rows(rows), pose.unflatten(0, (-1, count)), costs, config.num_searched))
-    return torch.cat(found)
-
-
-def _fitted(problem: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, K, num_dofs) fitted to the whole problem, best first, and their costs."""
-    count = poses.shape[1]
-    wide = problem.repeated(count)
-    fitted = fit_surface(wide, poses.flatten(0, 1), steps=SURFACE_FIT.search_steps, widths=SURFACE_FIT.widths[-1:]).pose
-    return _best_first(fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(len(poses), count))
-
-
-def _best_first(poses: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
-    order = costs.argsort(dim=1, stable=True)
-    return take_rows(poses, order), costs.gather(1, order)
-
-
-def _best_distinct(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> Tensor:
-    """Return the best ``count`` of poses (B, K, num_dofs) whose points differ; then duplicates of them."""
-    poses = take_rows(poses, costs.argsort(1)[:, : _CANDIDATES.max_compared])
-    order = distinct_first(mean_distances(problem, poses) < _CANDIDATES.same_rough * problem.size)
-    return take_rows(poses, order[:, :count])
+    return fit_rows(problem, poses)
 
 
 def _lead(problem: AlignProblem, poses: Tensor, costs: Tensor) -> Tensor:

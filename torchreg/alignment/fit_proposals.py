@@ -37,13 +37,7 @@ _FIT = _Fit()
 
 @dataclass(frozen=True, eq=False)
 class BestProposal:
-    """The proposal that explains most data.
-
-    Args:
-        pose: (B, num_dofs) after a coarse fit.
-        mean: (B, num_dofs) of the prior: its base, and the joints that the network thinks most probable.
-        lead: (B,) of its score over the best other one's.
-    """
+    """The pose (B, num_dofs) that explains most data, the mean of its prior, and its lead (B,) over the next."""
 
     pose: Tensor
     mean: Tensor
@@ -52,12 +46,7 @@ class BestProposal:
 
 @torch.no_grad()
 def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
-    """Return the pose that explains most data after a coarse fit, with the network's pose as the prior of its joints.
-
-    Args:
-        problem: the batch.
-        proposals: for its data.
-    """
+    """Return the pose that explains most data after a coarse fit, with the network's joints as the prior."""
     told = with_proposed_prior(problem, proposals)
     coarse = PoseSearch(told, torch.Generator().manual_seed(0)).coarse_problem
     poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
@@ -71,15 +60,7 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
 
 @torch.no_grad()
 def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
-    """Return the ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first.
-
-    All that are proposed are fitted, each also to the matches; without as many the last one repeats.
-
-    Args:
-        problem: the batch, with a prior as of `with_proposed_prior`.
-        proposals: for its data.
-        count: of poses.
-    """
+    """Return ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first."""
     coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
     poses = problem.clamp_candidates(proposals.poses)
     number = poses.shape[1]
@@ -92,12 +73,12 @@ def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> T
 
 
 def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
-    """Return a problem whose prior draws joints to the most probable proposal, but those of which something is told."""
+    """Return a problem whose prior's mean is the most probable proposal, except in joints with a prior."""
     mean = problem.clamp_candidates(proposals.poses[:, :1])[:, 0]
     precision = joint_precision(problem.skin.shape, problem.size, _FIT.joint_std)
-    if problem.told_precision is None:
+    if problem.prior_precision is None:
         return replace(problem, prior=GaussianPosePrior(mean, precision))
-    told, prior = problem.told_precision > 0, problem.prior
+    told, prior = problem.prior_precision > 0, problem.prior
     mean, precision = torch.where(told, prior.mean, mean), torch.where(told, prior.precision, precision)
     return replace(problem, prior=replace(prior, mean=mean, precision=precision))
 
@@ -110,11 +91,7 @@ def _fitted(coarse: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
-    """Return poses (B, num_dofs) in which a shape's points lie where a network says that the data are on it.
-
-    An EM from the prior's mean: to a model point belong the data near to it on the shape at rest, as far as the pose
-    takes it near to them.
-    """
+    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest."""
     skin, sigma, pose = problem.skin, _FIT.sigma * problem.size, problem.prior.mean
     near = torch.cdist(proposals.surface, skin.points).square()
     told = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1) * proposals.inlier.unsqueeze(-1)

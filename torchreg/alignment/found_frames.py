@@ -29,15 +29,7 @@ _TRUST = _Trust()
 
 @dataclass(frozen=True, eq=False)
 class FramePoses:
-    """Poses of T frames.
-
-    Args:
-        poses: (T, num_dofs).
-        statuses: of the alignments, T.
-        confidence: (T,) in them.
-        known: (T,) bool, whether the pose is a start for the next alignment; else the shape is searched in the frame.
-        searched: whether poses were not given.
-    """
+    """Poses (T, num_dofs), statuses, confidence (T,), and which are ``known`` (T,), starts for the next alignment."""
 
     poses: Tensor
     statuses: tuple[Status, ...]
@@ -71,7 +63,7 @@ class FramePoses:
         return replace(self, poses=poses, statuses=tuple(statuses), confidence=confidence, known=known)
 
     def of_person(self, shape: ArticulatedShape, data: Tensor, valid: Tensor, config: AlignConfig) -> FramePoses:
-        """Return the poses of a person whom frames (T, M, 3) show; the first that shows one surely tells who it is."""
+        """Return the poses of a rig in frames (T, M, 3); the first sure one gives its coefficients."""
         surest, first = None, 0
         for number, (points, kept) in enumerate(zip(data, valid, strict=True)):
             found = align(shape, points[kept], fit_shape=True, config=config)

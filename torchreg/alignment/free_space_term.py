@@ -26,13 +26,7 @@ INTRUSION = Intrusion()
 
 @dataclass(frozen=True, eq=False)
 class FreeSpaceTerm:
-    """The cost of skin points in free space, each as that of the data which would be seen if it were there.
-
-    Args:
-        free_space: of the pictures of B problems, in their coordinates.
-        area: that a skin point stands for, square metres.
-        tolerance: intrusion that costs nothing, metres.
-    """
+    """The cost of skin points of some area, square metres, in free space, beyond a tolerance, metres."""
 
     free_space: FreeSpace
     area: float
@@ -67,12 +61,7 @@ class FreeSpaceTerm:
         return (self.free_space.intrusion(points) - self.tolerance).clamp_min(0)
 
     def loss(self, points: Tensor, width: float) -> Tensor:
-        """Return the data (B, ...), softly counted, that points (B, ..., N, 3) in free space stand for.
-
-        Args:
-            points: of the skin.
-            width: of the kernel, metres.
-        """
+        """Return the number of data (B, ...), softly counted, that points (B, ..., N, 3) in free space stand for."""
         counted = welsch_loss((self.intrusion(points) / width).square()).sum(-1)
         return counted * self.weight().reshape(-1, *[1] * (counted.ndim - 1))
 

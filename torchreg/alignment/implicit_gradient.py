@@ -23,22 +23,10 @@ _FLAT = {torch.float32: 1e-6, torch.float64: 1e-12}
 
 @dataclass(frozen=True)
 class FixedPoint:
-    """The energy that the surface fit of a batch of clouds minimizes at its last width, about a start.
+    """The energy (21, 22) that the surface fit of a batch of clouds minimizes at its last width, about a start.
 
-    ``E(pose) = sum_j s^2 (1 - exp(-d(Y_j, pose)^2 / s^2)) / (2 noise^2) + sum_k p_k (pose - start)_k^2 / 2``, where the
-    base's rotation differs from the start's by composition. Its stationary point inside the joint limits is the pose.
-
-    Args:
-        shape: the articulated shape; or the tree of one whose variables end with shape coefficients.
-        surface: of the shape, twice differentiable in points, pose and, where wanted, the shape's parameters.
-        valid: (B, M) False where data are padding.
-        sigma: (B,) s, metres.
-        noise: (B,) metres.
-        precision: (num_dofs,) p.
-        lower: limits of the pose, (num_dofs,) or (B, num_dofs).
-        upper: limits of the pose, (num_dofs,) or (B, num_dofs).
-
-    References: Dewaele et al. 2006, eqs. 21 and 22.
+    ``E(pose) = sum_j s^2 (1 - exp(-d(Y_j, pose)^2 / s^2)) / (2 noise^2) + sum_k p_k (pose - start)_k^2 / 2``, with the
+    difference of base rotations by composition; s is sigma (B,), p precision (num_dofs,). Dewaele et al. 2006.
     """
 
     shape: ArticulatedShape | ShapedTree
@@ -56,16 +44,7 @@ class FixedPoint:
         return [value for value in self.shape.parameters() if value.requires_grad]
 
     def energy(self, step: Tensor, pose: Tensor, data: Tensor, start: Tensor) -> Tensor:
-        """Return the energy (B,) at poses moved by tangent steps, see `ArticulatedShape.retract`.
-
-        Args:
-            step: (B, num_dofs).
-            pose: (B, num_dofs).
-            data: (B, M, 3), metres.
-            start: (B, num_dofs).
-
-        Differentiable: in all but ``pose``'s rotation at half turns from the start, and the shape's parameters.
-        """
+        """Return the energy (B,) at poses moved by tangent steps (B, num_dofs), see `ArticulatedShape.retract`."""
         turn = step[:, 3:BASE_DOFS]
         joints = pose[:, BASE_DOFS:] + step[:, BASE_DOFS:]
         # The step of the base is taken by the data, backwards: then no rotation of the pose is special.
@@ -78,12 +57,7 @@ class FixedPoint:
         return cost + 0.5 * (self.precision * offset.square()).sum(-1)
 
     def derivatives(self, pose: Tensor, data: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradient (B, num_dofs), still differentiable in data, start and parameters, and the Hessian.
-
-        The Hessian (B, num_dofs, num_dofs) is exact, without a graph of its own.
-
-        Cost: num_dofs + 1 backward passes.
-        """
+        """Return the gradient (B, num_dofs), still differentiable, and the exact Hessian, without a graph."""
         with torch.enable_grad():
             step = torch.zeros_like(pose, requires_grad=True)
             energy = self.energy(step, pose.detach(), data, start)
@@ -99,10 +73,7 @@ class FixedPoint:
         return ~held_at_limits(gradient, pose, self.lower, self.upper)
 
     def newton_steps(self, pose: Tensor, data: Tensor, start: Tensor, steps: int) -> Tensor:
-        """Return the pose (B, num_dofs) after exact Newton steps, each kept where it lowers the norm of the gradient.
-
-        Differentiable: no.
-        """
+        """Return the pose (B, num_dofs) after Newton steps, each kept where it lowers the norm of the gradient."""
         pose, data, start = pose.detach(), data.detach(), start.detach()
         best = torch.full_like(pose[:, 0], torch.inf)
         kept, trial = pose, pose
@@ -123,18 +94,7 @@ class FixedPoint:
 
 
 def solve_symmetric(matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
-    """Return ``x`` with ``matrix x = right`` over the free variables, in float64; zero in the others.
-
-    Directions without curvature get zero, as from a pseudoinverse once every variable is scaled to a unit diagonal.
-
-    Args:
-        matrix: (B, D, D), symmetric.
-        right: (B, D).
-        free: (B, D) booleans.
-
-    Returns:
-        (B, D), in the dtype of ``right``.
-    """
+    """Return x (B, D) with ``matrix x = right`` over the ``free`` variables; zero in others and without curvature."""
     matrix, free_right = matrix.double(), right.double() * free
     diagonal = matrix.diagonal(dim1=-2, dim2=-1).abs()
     idle = ~free | (diagonal <= torch.finfo(torch.float64).tiny)
@@ -148,26 +108,10 @@ def solve_symmetric(matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
 
 
 def attach_gradients(problem: FixedPoint, pose: Tensor, data: Tensor, start: Tensor) -> Tensor:
-    """Return the pose of a fixed point with its gradients in data, start and the shape's parameters.
+    """Return a stationary pose (B, num_dofs) with its gradients in data, start and the shape's parameters.
 
-    Where ``g(pose, p) = 0`` is the stationarity of the energy over the variables that no limit holds, the implicit
-    function gives ``d pose / d p = -H^-1 dg / dp``: one solve per cloud, however many iterations found the pose, and as
-    exact as the pose is stationary. Correspondences and widths are held fixed.
-
-    Args:
-        problem: the energy that the pose minimizes.
-        pose: (B, num_dofs), stationary.
-        data: (B, M, 3), metres.
-        start: (B, num_dofs).
-
-    Returns:
-        (B, num_dofs), equal to ``pose``.
-
-    Differentiable: once, in ``data``, ``start`` and the parameters of ``problem``.
-
-    Cost: of the backward pass, num_dofs + 2 backward passes of the energy; memory of one double backward pass.
-
-    References: Krantz and Parks 2003, The implicit function theorem; Gould et al. 2016 for argmin layers.
+    By the implicit function theorem ``d pose / d p = -H^-1 dg / dp`` over the variables within their limits, with
+    correspondences and widths fixed (Krantz and Parks 2003; Gould et al. 2016).
     """
     return _Implicit.apply(problem, pose.detach(), data, start, *problem.parameters)
 

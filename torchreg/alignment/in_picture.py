@@ -25,19 +25,12 @@ Answer = TypeVar("Answer", AlignResult, PoseStarts)
 
 
 def surest_crop(
-    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], glance: Callable[[DepthFrame], float]
+    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], crop_score: Callable[[DepthFrame], float]
 ) -> tuple[Answer, DepthFrame]:
-    """Return the answer of highest confidence for the crops of a frame, and that crop; nearer ones are tried first.
-
-    Args:
-        frame: the picture.
-        size: of the shape, metres.
-        answer: what is found in a crop.
-        glance: how well a crop is explained at first sight, from 0 to 1: of a surface, the best are tried first.
-    """
+    """Return the answer of highest confidence for the crops of a frame, and that crop; near ones are tried first."""
     best: tuple[Answer, DepthFrame] | None = None
     for crops in candidate_crops(frame, size):
-        for crop, is_likely in _likely_first(crops, glance):
+        for crop, is_likely in _likely_first(crops, crop_score):
             # What needs a search is tried where no other crop is believed.
             if best is not None and not is_likely and _confidence(best[0]) >= CHOICE.enough:
                 break
@@ -55,9 +48,11 @@ def surest_crop(
     return answer(everything), everything
 
 
-def _likely_first(crops: Iterable[DepthFrame], glance: Callable[[DepthFrame], float]) -> list[tuple[DepthFrame, bool]]:
+def _likely_first(
+    crops: Iterable[DepthFrame], crop_score: Callable[[DepthFrame], float]
+) -> list[tuple[DepthFrame, bool]]:
     """Return crops, the likeliest first, and whether they are likely to show anything without a search."""
-    seen = sorted(((glance(crop), crop) for crop in crops), key=lambda pair: -pair[0])
+    seen = sorted(((crop_score(crop), crop) for crop in crops), key=lambda pair: -pair[0])
     return [(crop, likely >= CHOICE.enough) for likely, crop in seen]
 
 

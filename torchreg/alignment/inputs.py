@@ -49,17 +49,9 @@ _FITTED = _Fitted()
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a shape is aligned to.
+    """What a shape is aligned to: points ((B,) M, 3), metres, unchecked, or those of depth frames, and keypoints.
 
-    Args:
-        points: (M, 3) or (B, M, 3), metres; unchecked.
-        mask: (M,) or (B, M), False where points are padding; None without.
-        free_space: of B pictures, or one, where the points are those of depth frames.
-        frames: these frames.
-        keypoints: measured beside, or None.
-        origin: (3,) that the points begin at, where it is not that of the frames.
-        everything: the clouds of which the points are a draw, checked, and which of their points are valid; None
-            where the points are all there are.
+    `origin` (3,) is where the points begin; `everything` are checked clouds and valid points of which these are a draw.
     """
 
     points: Any
@@ -72,12 +64,7 @@ class Observation:
 
     @classmethod
     def of(cls, data: Any, mask: Tensor | None) -> Observation:
-        """Return what is given: points, something with points, a depth frame or a sequence of depth frames.
-
-        Raises:
-            InputError: if there is a mask beside depth frames, which have their own, or a sequence is empty.
-            InputTypeError: if a sequence holds other things beside depth frames.
-        """
+        """Return the observation of points, something with points, a depth frame or a sequence of depth frames."""
         several = isinstance(data, Sequence) and any(isinstance(item, DepthFrame) for item in data)
         frames = list(data) if several else [data]
         if not isinstance(frames[0], DepthFrame) and not several:
@@ -101,16 +88,7 @@ class Observation:
 
     @torch.no_grad()
     def drawn(self, shape: ArticulatedShape, nan_policy: str, seed: int, *, to_search: bool = False) -> Observation:
-        """Return the same with as many of the points of each cloud as poses are fitted to, where there are more.
-
-        Dense regions and copies do not outvote others, see `draw_spread`; depth frames are taken at a coarser grid.
-
-        Args:
-            shape: that poses are of.
-            nan_policy: "raise", or "omit" to leave out points that are not finite.
-            seed: of the draw.
-            to_search: whether many poses are fitted, for which fewer points do, not one.
-        """
+        """Return the same with at most as many points per cloud as poses are fitted to, evenly spread."""
         sizes = as_float_tensor(self.points, "data").shape
         is_large = len(sizes) > 1 and sizes[-2] > _FITTED.most
         count = _FITTED.searched if to_search else _FITTED.most
@@ -174,21 +152,7 @@ def check_clouds(
     mask_name: str = "mask",
     omit_option: str = "nan_policy='omit'",
 ) -> tuple[Tensor, Tensor]:
-    """Return clouds (..., M, 3) in the shape's dtype and their valid points (..., M): neither masked nor left out.
-
-    Args:
-        shape: whose dtype and device the clouds take.
-        clouds: (M, 3) or (B, M, 3).
-        mask: (M,) or (B, M), False where clouds are padding.
-        nan_policy: "raise", or "omit" to leave out points that are not finite.
-        name: of the argument, for the message.
-        mask_name: of the mask's argument.
-        omit_option: setting that leaves out points that are not finite, for the message.
-
-    Raises:
-        InputError: if the clouds are empty, not finite, or do not fit the mask.
-        InputTypeError: if something has the wrong type.
-    """
+    """Return clouds (..., M, 3) in the shape's dtype and their valid points (..., M): neither masked nor left out."""
     clouds = as_float_tensor(clouds, name, like=shape.rest)
     if clouds.ndim not in (2, 3):
         raise InputError(f"{name} must have shape (M, 3) or (B, M, 3), got {tuple(clouds.shape)}")
@@ -221,22 +185,14 @@ def _remedy(ratio: float) -> str:
 
 
 def floating_origin(shape: ArticulatedShape, clouds: Tensor) -> Tensor | None:
-    """Return the origin (3,) about which clouds far from that of coordinates are aligned; None for others.
-
-    A shape whose base is bolted down stays where it is.
-    """
+    """Return the origin (3,) about which far clouds are aligned; None for near clouds and bolted shapes."""
     if not isinstance(clouds, Tensor) or clouds.ndim < 2 or clouds.shape[-1] != 3:
         return None
     return far_origin(clouds) if bool(torch.isinf(shape.lower[:3]).all()) else None
 
 
 def check_skin(shape: ArticulatedShape, skin: LinearBlendSkin) -> LinearBlendSkin:
-    """Return model points given as a skin, with constant weights.
-
-    Raises:
-        InputError: if the skin is of another shape.
-        InputTypeError: if it is no skin.
-    """
+    """Return model points given as a skin of the shape, with constant weights."""
     if not isinstance(skin, LinearBlendSkin):
         raise InputTypeError(
             f"model_points must be a skin of the shape, as from sample_skin, got {type(skin).__name__}"
@@ -247,14 +203,7 @@ def check_skin(shape: ArticulatedShape, skin: LinearBlendSkin) -> LinearBlendSki
 
 
 def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: int) -> bool:
-    """Return True, after a `UnitsWarning`, if data cannot be in the units of a shape, as with millimeters for metres.
-
-    Args:
-        data: ((B,) M, 3), each cloud with its mean at the origin; less than ten points have no reliable size.
-        valid: ((B,) M) False where padded.
-        size: of the shape, metres.
-        stacklevel: of the warning: 1 for the caller.
-    """
+    """Return True, after a `UnitsWarning`, if the size of clouds of ten points or more is not in the shape's units."""
     radius = torch.where(valid, data.norm(dim=-1), torch.nan).nanmedian(-1).values
     ratio = 2 * float(radius.nanmedian()) / size
     # Data at one place have no size in any unit.
@@ -270,25 +219,12 @@ def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: in
 
 
 def are_degenerate(data: Tensor, valid: Tensor, size: float) -> Tensor:
-    """Return which clouds ((B,)) lie at one place, on a line or on a plane, and so determine no pose.
-
-    Args:
-        data: ((B,) M, 3).
-        valid: ((B,) M) False where padded; clouds of less than ten points are too small to tell.
-        size: of the shape, metres.
-    """
+    """Return which clouds ((B,)) of ten or more points lie at one place, on a line or on a plane."""
     return (spread_dimensions(data, size, valid) < len(SPREADS)) & (valid.sum(-1) >= UNITS.min_data)
 
 
 def warn_about_degenerate(data: Tensor, valid: Tensor, size: float, *, stacklevel: int) -> Tensor:
-    """Return `are_degenerate`, after a `DegenerateDataWarning` about the worst of such clouds.
-
-    Args:
-        data: ((B,) M, 3).
-        valid: ((B,) M) False where padded.
-        size: of the shape, metres.
-        stacklevel: of the warning: 1 for the caller.
-    """
+    """Return `are_degenerate`, after a `DegenerateDataWarning` about the worst of such clouds."""
     degenerate = are_degenerate(data, valid, size)
     if bool(degenerate.any()):
         where = SPREADS[int(spread_dimensions(data, size, valid)[degenerate].min())]

@@ -1,4 +1,4 @@
-"""What is known of a pose beforehand: degrees of freedom that are held, and what encoders read of others."""
+"""Locked degrees of freedom, and priors on others, as from encoders."""
 
 from __future__ import annotations
 
@@ -25,13 +25,7 @@ _HELD_STD = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class KnownDofs:
-    """What is known of a pose.
-
-    Args:
-        locked: (num_dofs,) True for what is held at its start.
-        mean: (num_dofs,) or (B, num_dofs) of a prior; zero where it has none.
-        std: of the prior, of the same size; infinite where it has none.
-    """
+    """Locked degrees of freedom (num_dofs,), and mean and std ((B,) num_dofs) of a prior; zero and infinite without."""
 
     locked: Tensor
     mean: Tensor
@@ -39,18 +33,7 @@ class KnownDofs:
 
     @classmethod
     def of(cls, shape: ArticulatedShape, locked: Any, prior: Any) -> KnownDofs | None:
-        """Return what users say; None if that is nothing.
-
-        Args:
-            shape: the articulated shape.
-            locked: names of degrees of freedom, "base" for all six of the base, or a mask (num_dofs,).
-            prior: mean and standard deviation, metres and radians: each a tensor (num_dofs,) or (B, num_dofs), or a
-                dictionary by name; the deviation also one number for all that the mean names, the joints of a tensor.
-
-        Raises:
-            InputError: if a name is unknown, a size does not fit or a deviation is not positive.
-            InputTypeError: if something has the wrong type.
-        """
+        """Parse ``locked`` and ``prior`` as given to `align`; None if there is neither."""
         held = _read_locked(shape, locked)
         if prior is None:
             return (
@@ -72,12 +55,12 @@ class KnownDofs:
         return cls(held, mean.nan_to_num(0.0), deviation)
 
     def holding(self, pose: Tensor) -> KnownDofs:
-        """Return the same with what is locked held as in a pose (num_dofs,), also where a search begins anew."""
+        """Return the same with locked degrees of freedom at their values in a pose (num_dofs,), also in a search."""
         mean = torch.where(self.locked, pose.to(self.mean), self.mean)
         return replace(self, mean=mean, std=torch.where(self.locked, _HELD_STD, self.std))
 
     def start(self, shape: ArticulatedShape, pose: Tensor | None = None) -> Tensor:
-        """Return the pose with the prior's mean where it has one; of what is not told, a given pose or that at rest."""
+        """Return the prior's mean where it has one, elsewhere a given pose or the rest pose."""
         return torch.where(self.std.isfinite(), self.mean, shape.rest if pose is None else pose)
 
     @property
@@ -89,11 +72,8 @@ class KnownDofs:
         """Return the same in coordinates that begin at an origin (3,)."""
         return replace(self, mean=torch.where(self.std.isfinite(), shifted(self.mean, -origin.to(self.mean)), 0.0))
 
-    def applied(self, problem: AlignProblem, start: Tensor) -> AlignProblem:
-        """Return a problem whose prior and limits hold what is known, about starts (B, num_dofs), centered as it is.
-
-        Neighboring data err together: the prior counts as many times as data share an error.
-        """
+    def with_prior(self, problem: AlignProblem, start: Tensor) -> AlignProblem:
+        """Return a problem with this prior, as many times as data share an error, and limits about starts (B, D)."""
         has_prior = self.std.isfinite()
         mean = torch.where(has_prior, shifted(self.mean.expand_as(start), -problem.origin), problem.prior.mean)
         told = torch.where(has_prior, self.std, 1.0).square().reciprocal()
@@ -105,10 +85,10 @@ class KnownDofs:
             lower=torch.where(self.locked, start, lower),
             upper=torch.where(self.locked, start, upper),
             prior=GaussianPosePrior(mean, precision, holds_base=bool(has_prior[..., :BASE_DOFS].any())),
-            told_precision=torch.where(has_prior, told, 0.0).expand_as(start),
+            prior_precision=torch.where(has_prior, told, 0.0).expand_as(start),
         )
 
-    def informed(self, problem: AlignProblem, poses: Tensor) -> Tensor:
+    def substitute_prior_means(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         """Return candidates (B, K, num_dofs) with the prior's mean where it says more than that a pose is plausible."""
         broad = BROAD_PRIOR.precision(problem.skin.shape, problem.size).rsqrt()
         known = (self.std < broad).expand_as(problem.prior.mean).unsqueeze(1)

@@ -67,14 +67,7 @@ class _Objective:
 
 @dataclass(frozen=True, eq=False)
 class KeypointFit:
-    """Poses found, best first, in coordinates that begin at an origin.
-
-    Args:
-        problem: a single one, without data.
-        poses: (S, num_dofs), of which those that fall together with a better one come last.
-        costs: (S,).
-        lead: () cost by which the best of different poses is worse than the first.
-    """
+    """Poses (S, num_dofs), best and different ones first, costs (S,), and the lead () over the next different one."""
 
     problem: AlignProblem
     poses: Tensor
@@ -101,11 +94,7 @@ class KeypointFit:
         return torch.linalg.inv(information).to(pose)
 
     def confidence(self, covariance: Tensor) -> Tensor:
-        """Return the probability () that the ends of the limbs are where the first pose has them.
-
-        Their mean distance from the true ones is taken for Rayleigh's, as their covariance tells, and the second-best
-        pose to be as probable as it is likely.
-        """
+        """Return the probability () that the limbs end where the first pose has them, by a Rayleigh distribution."""
         skin = self.problem.skin
         moves = end_motions(skin, self.poses[:1], limb_ends(skin))
         variance = end_variances(moves, covariance).sqrt().mean().square()
@@ -120,18 +109,7 @@ def fit_keypoints(
     start: Tensor | None,
     known: KnownDofs | None,
 ) -> KeypointFit:
-    """Return the poses in which a shape's keypoints lie where they were measured.
-
-    Args:
-        shape: the articulated shape.
-        skin: its model points.
-        measured: its keypoints, of a single frame.
-        start: (num_dofs,) or (S, num_dofs); None to search all around.
-        known: of the pose, if anything is.
-
-    Raises:
-        InputError: if there are several frames, or a shape whose base is held lies elsewhere.
-    """
+    """Return the poses that explain the keypoints of a frame, from starts ((S,) num_dofs) or a global search."""
     if measured.targets.ndim != 2:
         raise InputError(f"keypoints alone must be of one frame, (K, 2) or (K, 3), got {tuple(measured.targets.shape)}")
     origin = _center(shape, measured)[None]
@@ -141,7 +119,8 @@ def fit_keypoints(
         prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
     )  # fmt: skip
     if known is not None:
-        problem = known.applied(problem, shifted(known.start(shape, start if start is None else near)[None], -origin))
+        given = known.start(shape, start if start is None else near)
+        problem = known.with_prior(problem, shifted(given[None], -origin))
     if start is None:
         pool, widths = _all_around(problem), _SEARCH.widths
     else:
@@ -252,11 +231,7 @@ def find_keypoints(
 def measured_alone(
     shape: ArticulatedShape, camera: Camera | None, keypoints: Any, keypoint_std: Any
 ) -> MeasuredKeypoints:
-    """Return keypoints that are all that was measured.
-
-    Raises:
-        InputError: if there are none.
-    """
+    """Return keypoints that are the only measurement, checked."""
     if keypoints is None:
         raise InputError("data must be given, or keypoints: there is nothing to align to")
     return MeasuredKeypoints.of(shape, keypoints, keypoint_std, camera, keypoint_extent(shape))

@@ -1,4 +1,4 @@
-"""Landmarks: keypoints of the shape that a detector measured, in space or in a picture, as evidence beside the data."""
+"""Landmarks: keypoints of the shape that a detector measured, in space or in a picture."""
 
 from __future__ import annotations
 
@@ -39,13 +39,7 @@ LANDMARKS = LandmarkModel()
 class Landmarks:
     """Measured keypoints of B problems, each a Gaussian about its true place or, with a small share, anywhere.
 
-    Args:
-        skin: the shape's keypoints, as points that parts carry.
-        targets: (B, K, 3) metres in the problems' coordinates, or (B, K, 2) pixels as (column, row); zero if unseen.
-        seen: (B, K) bool.
-        std: (B, K) in metres or pixels.
-        camera: of the pixels, None for targets in space.
-        origin: (B, 3) of the problems' coordinates, metres.
+    Targets (B, K, 3) in metres from the origins, or (B, K, 2) pixels (column, row) of a camera; zero if unseen.
     """
 
     skin: LinearBlendSkin
@@ -75,12 +69,7 @@ class Landmarks:
         return self.seen & (residual.square().sum(-1) < LANDMARKS.wrong**2 * self.std.square())
 
     def cost(self, pose: Tensor, width: Tensor | float) -> Tensor:
-        """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs), zero where all are right.
-
-        Args:
-            pose: of the problems.
-            width: (B,) by which landmarks may be off beside their own errors while a fit is coarse, metres.
-        """
+        """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs); ``width`` (B,) adds to the std."""
         several = pose.reshape(len(pose), -1, pose.shape[-1])
         residual = self._measured(self.skin(several)) - self.targets.unsqueeze(1)
         square = residual.square().sum(-1) / self._variance(width).unsqueeze(1)
@@ -138,13 +127,7 @@ def _loss(square: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredKeypoints:
-    """Landmarks as they were given, checked.
-
-    Args:
-        targets: ((B,) K, 3) metres in the world, or ((B,) K, 2) pixels; NaN where unseen.
-        std: (K,) or (), in metres or pixels.
-        camera: of the pixels.
-    """
+    """Targets ((B,) K, 3) in metres in the world, or ((B,) K, 2) in pixels, NaN where unseen, and their std ((K,))."""
 
     targets: Tensor
     std: Tensor
@@ -152,12 +135,7 @@ class MeasuredKeypoints:
 
     @classmethod
     def of(cls, shape: Articulation, keypoints: Any, std: Any, camera: Camera | None, size: float) -> MeasuredKeypoints:
-        """Return the landmarks of a shape of some size.
-
-        Raises:
-            InputError: if there are not as many as the shape has keypoints, none is seen, pixels have no camera, or a
-                standard deviation is not positive.
-        """
+        """Return the checked landmarks of a shape of some size."""
         targets = as_float_tensor(keypoints, "keypoints", like=shape.rest)
         count = shape.keypoints(shape.rest_pose()).shape[-2]
         if targets.ndim not in (2, 3) or targets.shape[-2] != count or targets.shape[-1] not in (2, 3):

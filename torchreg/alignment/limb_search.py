@@ -24,18 +24,7 @@ from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 @dataclass(frozen=True)
 class Effort:
-    """Thoroughness of placing limbs. Widths are shares of the model's size.
-
-    Args:
-        num_data: data that the joints' samples are tried on.
-        width: of the kernel by which a datum counts as explained by a sample.
-        beam: configurations kept from body to body.
-        configurations: kept per limb.
-        refine_widths: of the kernel in the steps that move configurations onto the data; no steps if empty.
-        score_width: of the kernel by which combinations are judged, on all data if configurations are refined.
-        combinations: returned.
-        exchanged: of them improved by exchanging pairs of limbs.
-    """
+    """Thoroughness of placing limbs. Widths are shares of the model's size."""
 
     num_data: int
     width: float
@@ -78,13 +67,7 @@ _PLACEMENT = _Placement()
 
 @dataclass(frozen=True)
 class _Beam:
-    """Configurations of a limb.
-
-    Args:
-        poses: (B, K, num_dofs).
-        losses: (B, K, M), from 0 for a datum that is explained to 1.
-        frames: (B, K, 4, 4) of the part that the next body hangs on.
-    """
+    """Configurations (B, K, num_dofs) of a limb, losses (B, K, M) from 0 (explained) to 1, frames of the next body."""
 
     poses: Tensor
     losses: Tensor
@@ -131,11 +114,7 @@ def joint_samples(shape: Articulation, body: Body) -> Tensor:
 
 
 class LimbSearch:
-    """The samples of a shape's joints, and the search over them.
-
-    Args:
-        shape: the articulated shape.
-    """
+    """The samples of a shape's joints, and the search over them."""
 
     def __init__(self, shape: Articulation) -> None:
         self.shape = shape
@@ -153,19 +132,7 @@ class LimbSearch:
         self.relative = {} if shape.kinematics.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
 
     def __call__(self, problem: AlignProblem, poses: Tensor, effort: Effort, generator: torch.Generator) -> Tensor:
-        """Return the best combinations of limb configurations, best first.
-
-        Args:
-            problem: the batch.
-            poses: (B, num_dofs): position of the trunk, and a configuration of the limbs to try beside the samples.
-            effort: how thoroughly to search.
-            generator: draws the data that samples are tried on.
-
-        Returns:
-            (B, C, num_dofs).
-
-        Cost: O(B num_data K) per body, K at most 1,500 configurations.
-        """
+        """Return the best limb configurations (B, C, num_dofs) on the trunks of poses (B, num_dofs), tried as well."""
         if not self.limbs:
             return poses.unsqueeze(1)
         rows = rows_in_memory(len(poses), effort.num_data * _PLACEMENT.max_tried, poses.device)
@@ -175,11 +142,11 @@ class LimbSearch:
 
     def knows(self, problem: AlignProblem, limb: Limb) -> bool:
         """Return whether the joints of a limb are known beforehand as well as samples would tell them."""
-        if problem.told_precision is None:
+        if problem.prior_precision is None:
             return False
         slides = (self.shape.upper - self.shape.lower) / _SAMPLING.slide_count
         spacing = torch.where(self.shape.is_sliding, slides, _SAMPLING.angle)[limb.dofs]
-        return bool((problem.told_precision[:, limb.dofs].rsqrt() <= spacing).all())
+        return bool((problem.prior_precision[:, limb.dofs].rsqrt() <= spacing).all())
 
     def _leader(self, follower: Limb) -> Limb:
         """Return the limb whose degrees of freedom move the first body of one that has none."""
@@ -207,10 +174,7 @@ class LimbSearch:
 
 
 class _Search:
-    """One search, over a batch of problems.
-
-    Samples are tried on a subset of the data with a wide kernel; combinations are judged on ``problem``.
-    """
+    """One search over a batch: samples are tried on a subset of the data, combinations on ``problem``."""
 
     def __init__(self, limbs: LimbSearch, problem: AlignProblem, subset: AlignProblem, effort: Effort) -> None:
         self.limbs, self.shape, self.effort, self.subset = limbs, limbs.shape, effort, subset

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,9 +10,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.clusters import clustered_data, leaves_clusters
+from torchreg.alignment.confidence import explains
 from torchreg.alignment.pose_search import PoseSearch
 from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.reliability import CALIBRATION
+from torchreg.alignment.whole_alignment import align_rows, fit_rows
+from torchreg.shapes.limbs import Limb, find_limbs
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
+from torchreg.shapes.surface import SkinSurface
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class _Around:
     fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
+    aligned: int = 16  # candidates of a skinned rig
     data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
     entries: int = 4_000_000  # of a table in memory
 
@@ -56,16 +63,16 @@ _AROUND = _Around()
 def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
     """Return a mask (B,) of problems with which a single descent cannot be trusted.
 
-    Either it went far from its start, where other minima are as near; or it leaves an unexplained cluster of data.
+    Either it went far from its start, where other minima are as near; or it leaves an unexplained cluster of data. Of a
+    skinned rig it is what data it leaves unexplained alone: a redundant bone of its spine may turn far.
     """
+    if isinstance(problem.surface, SkinSurface):
+        return explains(problem, pose, torch.full_like(pose[:, 0], torch.inf)) < CALIBRATION.doubtful
     return (_motion(start, pose) > _TRUST.motion) | leaves_clusters(problem, pose)
 
 
 def _motion(start: Tensor, pose: Tensor) -> Tensor:
-    """Return the motion (B,) between poses, radians: of the base or the joints, the larger.
-
-    That of the joints is their root mean square, or half the largest.
-    """
+    """Return the motion (B,) between poses, radians: of the base, or the joints' RMS or half their largest."""
     step = difference(start, pose)
     joints = pad(step[:, BASE_DOFS:].abs(), (0, 1))
     moved = torch.maximum(joints.square().mean(-1).sqrt(), 0.5 * joints.amax(-1))
@@ -73,18 +80,14 @@ def _motion(start: Tensor, pose: Tensor) -> Tensor:
 
 
 def explore(
-    problem: AlignProblem,
-    start: Tensor,
-    descended: Tensor,
-    *,
-    candidates: int,
-    rounds: int,
-    generator: torch.Generator,
+    problem: AlignProblem, start: Tensor, descended: Tensor, *, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
     """Return the best poses found around the starts; the problems of a batch are searched together.
 
     Limbs are placed anew from the descended pose. Where that shows that it was in a wrong minimum, candidates are
     scattered around the start and the best pose so far, and go through `PoseSearch` in one batch.
+
+    All joints of a skinned rig's candidates are aligned instead, see `align_rows`.
 
     Args:
         problem: the batch.
@@ -111,6 +114,8 @@ def _explore(
     problem: AlignProblem, start: Tensor, descended: Tensor, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
     """Return the best poses of a thorough search from each descent and, where needed, of one from all around."""
+    if isinstance(problem.surface, SkinSurface):
+        return _aligned_around(problem, start, descended, generator)
     search = PoseSearch(problem, generator)
     before = search.fitted_score(descended)
     poses, scores = search.refine(descended.unsqueeze(1), 1)
@@ -126,11 +131,21 @@ def _explore(
     return best
 
 
+def _aligned_around(problem: AlignProblem, start: Tensor, descended: Tensor, generator: torch.Generator) -> Tensor:
+    """Return the best poses of rigs whose candidates around the starts and the descents are aligned whole."""
+    limbs = find_limbs(problem.skin.shape)[0]
+    pool = [_scatter(problem, limbs, center, _AROUND.aligned // 2, generator) for center in (start, descended)]
+    return fit_rows(problem, align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, generator))[0][:, 0]
+
+
 def _search_around(
     search: PoseSearch, start: Tensor, best: Tensor, candidates: int, rounds: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Return the poses found from candidates around the starts and the best poses so far, and scores (B,)."""
-    scattered = [_scatter(search, center, max(1, candidates // 2), generator) for center in (start, best)]
+    scattered = [
+        _scatter(search.problem, search.limbs.limbs, center, max(1, candidates // 2), generator)
+        for center in (start, best)
+    ]
     pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1), _AROUND.fit_steps)
     placed = search.prune(pool[:, : max(1, round(_AROUND.placed_share * pool.shape[1]))], _AROUND.num_refined)
     poses, scores = search.refine(placed[:, :1], rounds)
@@ -144,13 +159,14 @@ def _search_around(
     return found, value
 
 
-def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def _scatter(
+    problem: AlignProblem, limbs: Sequence[Limb], center: Tensor, count: int, generator: torch.Generator
+) -> Tensor:
     """Return (B, count, num_dofs) candidates; the first is the center itself."""
-    problem = search.problem
     shape = problem.skin.shape
     scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
-    scale = problem.at_most_told(scale).unsqueeze(1)
+    scale = problem.cap_std_by_prior(scale).unsqueeze(1)
     noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
     around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)
@@ -160,7 +176,7 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     redrawn = low.unsqueeze(1) + span.unsqueeze(1) * torch.rand(
         noise.shape, generator=generator, dtype=torch.float32
     ).to(center)
-    for limb in search.limbs.limbs:
+    for limb in limbs:
         is_redrawn = torch.rand(count, 1, generator=generator, dtype=torch.float32).to(center) < _SCATTER.redrawn_limbs
         is_redrawn[0] = False
         around[..., limb.dofs] = torch.where(is_redrawn, redrawn[..., limb.dofs], around[..., limb.dofs])

@@ -26,10 +26,7 @@ _BASE_DAMPING_DATA = 0.1
 class GaussianPosePrior:
     """A Gaussian on the pose, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves a variable free.
 
-    Args:
-        mean: (B, num_dofs).
-        precision: (num_dofs,) or (B, num_dofs), 1 / std^2.
-        holds_base: whether the base's precision is not zero; its rotations then differ by composition.
+    Mean (B, num_dofs), precision ((B,) num_dofs); with `holds_base`, base rotations differ by composition.
     """
 
     mean: Tensor
@@ -72,13 +69,6 @@ class RegistrationObjective:
     """Eq. 20, ``sum_i lambda_i |T(X_i, pose) - G_i|^2 / 2 sigma^2``, over the model points only.
 
     The skin is linear in the part transforms, so the curvature over all points collapses into one small matrix.
-
-    Args:
-        skin: the model points X.
-        matches: lambda and G from the E-step.
-        sigma: (B,) metres.
-        prior: on the joints.
-        landmarks: measured keypoints, or None.
     """
 
     def __init__(
@@ -123,18 +113,8 @@ class RegistrationObjective:
 class SurfaceObjective:
     """Eqs. 21 and 22: squared surface distances of the data, each weighted by ``beta = exp(-d^2 / sigma_s^2)``.
 
-    With beta recomputed at every pose this is the Welsch function ``sigma_s^2 (1 - beta) / 2``, which never increases.
-
-    Args:
-        surface: the surface to fit.
-        data: (B, M, 3), metres.
-        valid: (B, M) one, or zero where padded.
-        sigma: (B,) kernel width sigma_s, metres.
-        noise: (B,) standard deviation of the distances, metres; weighs data against the prior.
-        prior: on the pose.
-        lever: distance of the shape's points from the base's axis of rotation, metres.
-        free_space: what depth pictures say against a pose, and the skin whose points it looks at; None for clouds.
-        landmarks: measured keypoints, or None.
+    Beta at every pose makes it the Welsch function ``sigma_s^2 (1 - beta) / 2``. Sigma and noise (B,) are in metres;
+    ``lever`` is the distance of the shape's points from the base's axis of rotation.
     """
 
     def __init__(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.alignment.confidence import DataOnSurface, end_motions
+from torchreg.alignment.confidence import SurfaceResiduals, end_motions
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_objective
@@ -33,11 +33,7 @@ _OPEN = _Open()
 
 
 def plausible_variance(shape: Articulation, size: float, span: Tensor | None = None) -> Tensor:
-    """Return the variance (..., num_dofs) of poses of which no more is known than the limits of the joints.
-
-    That of the uniform distribution over the limits, of which a shape's own may be narrowed to a ``span``, but at most
-    the square of a radian, or of half the size where they slide.
-    """
+    """Return the variance (..., num_dofs) of a uniform pose in the limits, at most a radian or half the size."""
     span = shape.upper - shape.lower if span is None else span
     uniform = span.square().clamp_min(_OPEN.least_span**2) / 12
     return torch.minimum(uniform, BROAD_PRIOR.precision(shape, size).reciprocal())
@@ -66,25 +62,21 @@ def spread_of(name: str, std: float, slides: bool) -> str:
 
 
 def far_variance(
-    problem: AlignProblem, pose: Tensor, lying: DataOnSurface, *, noise: Tensor, shared: Tensor, precision: Tensor
+    problem: AlignProblem,
+    pose: Tensor,
+    residuals: SurfaceResiduals,
+    *,
+    noise: Tensor,
+    shared: Tensor,
+    precision: Tensor,
 ) -> Tensor:
-    """Return variances (B, num_dofs) by what data say of poses in which one joint alone is turned far; else zero.
+    """Return variances (B, num_dofs) from poses in which one joint alone is turned far, zero where those are excluded.
 
-    The facets or the noise of a surface of revolution about a joint's axis have slopes, by which its turn seems to be
-    determined. A pose turned by ``a``, one standard deviation without data, where the objective is higher by ``E``
-    is as probable as ``exp(-E)`` and adds ``a^2 exp(-E)``. That is asked of joints along whose motion the surface
-    hardly has a slope.
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        lying: how its data lie in these poses.
-        noise: (B,) of the data, metres.
-        shared: (B,) number of data that err together.
-        precision: (B, num_dofs) without data.
+    A pose turned by ``a``, one standard deviation without data, with an objective higher by ``E`` adds ``a^2 exp(-E)``.
+    It is computed for joints along whose motion the surface hardly has a slope, as of a cylinder.
     """
-    near = welsch_weight((lying.distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square())
-    row, dof = _nearly_of_revolution(problem, pose, lying.jacobian, near * problem.valid).nonzero().unbind(-1)
+    near = welsch_weight((residuals.distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square())
+    row, dof = _nearly_of_revolution(problem, pose, residuals.jacobian, near * problem.valid).nonzero().unbind(-1)
     found = torch.zeros_like(pose)
     if len(row) == 0:
         return found

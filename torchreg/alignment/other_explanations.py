@@ -32,10 +32,7 @@ ALTERNATIVES = Alternatives()
 
 
 def open_rims(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> Tensor:
-    """Return the share (B,) of the rim of what lies on the shape along which the measured surface goes on.
-
-    A shape that stands free ends where its picture jumps; one that is cut out of a wall does not. Zero without frames.
-    """
+    """Return the share (B,) of the rim of the data on the shape where the surface continues; zero without frames."""
     shares = torch.zeros_like(pose[:, 0])
     for row, frame in enumerate(frames if len(frames) == len(pose) else ()):
         shares[row] = open_rim(frame, partial(_lies_on, problem, pose, row))
@@ -52,14 +49,7 @@ def _lies_on(problem: AlignProblem, pose: Tensor, row: int, points: Tensor) -> T
 
 
 def planes_instead(problem: AlignProblem, distance: Tensor) -> Tensor:
-    """Return by how much better a few planes explain what lies on the shape, (B,), from 0 (not at all) to 1.
-
-    That is the logarithm of the ratio of the noise about the shape to that about the planes, as a share of its range.
-
-    Args:
-        problem: the batch.
-        distance: (B, M) of its data from the surface.
-    """
+    """Return by how much better a few planes explain the data on the shape, (B,), from 0 (not at all) to 1."""
     stride = -(-problem.data.shape[1] // ALTERNATIVES.num_data)
     data, distance, valid = (values[:, ::stride] for values in (problem.data, distance, problem.valid))
     on_shape = valid & (distance.abs() < ALTERNATIVES.on_shape * problem.size)

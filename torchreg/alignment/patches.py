@@ -1,4 +1,4 @@
-"""How many data are independent where whole parts err together, as by a mesh, a joint or a depth that is off."""
+"""Effective sample size under patch-correlated errors, as of a mesh, a joint or a depth."""
 
 from __future__ import annotations
 
@@ -15,12 +15,6 @@ def independent_share(points: Tensor, size: float) -> float:
 
 
 def errors_per_patch(data: Tensor, valid: Tensor, size: float) -> Tensor:
-    """Return how many data (B,) err as one: those in a patch, on average.
-
-    Args:
-        data: (B, M, 3).
-        valid: (B, M) False where padded.
-        size: of the model, metres.
-    """
+    """Return the mean number (B,) of data in a patch, which err as one, of a model of some size."""
     shares = [independent_share(points[chosen], size) for points, chosen in zip(data, valid, strict=True)]
     return torch.tensor([1 / share for share in shares]).to(data)

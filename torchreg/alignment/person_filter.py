@@ -1,4 +1,4 @@
-"""Who is followed: the shape coefficients of one person, of which every frame tells more."""
+"""Recursive estimate of shape coefficients, frame by frame (iterated Kalman)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,7 @@ from torchreg.shapes.shaped_surface import ShapedSurface
 
 @dataclass(frozen=True)
 class KnownPerson:
-    """What is known of a person: a Gaussian on the coefficients.
-
-    Args:
-        coefficients: (K,) mean.
-        covariance: (K, K).
-    """
+    """A Gaussian on shape coefficients: mean (K,) and covariance (K, K)."""
 
     coefficients: Tensor
     covariance: Tensor
@@ -44,14 +39,7 @@ _UPDATE = PersonUpdate()
 
 
 class PersonFilter:
-    """Finds a person in a frame, and narrows what is known of its coefficients by further ones.
-
-    Args:
-        shape: a rig with coefficients, or any with a mesh.
-        fit_shape: True, or "bones", see `align`.
-        seed: of all random draws.
-        upright: see `AlignConfig`.
-    """
+    """Estimates the shape coefficients of a rig recursively, frame by frame; ``fit_shape`` as of `align`."""
 
     def __init__(
         self, shape: ArticulatedShape, fit_shape: bool | str, seed: int = 0, upright: Direction | None = None
@@ -67,13 +55,8 @@ class PersonFilter:
         joints = joint_precision(self.rig, self._size, self._config.prior_std)
         self._precision = plausible_precision(self.rig, self._size, joints).double()
 
-    def met(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
-        """Return the pose (num_dofs,) and the person that a frame shows; None where it shows nobody.
-
-        Args:
-            data: (M, 3), metres, or a frame.
-            start: (num_dofs,) of the mean person, or None.
-        """
+    def initialize(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
+        """Return the pose (num_dofs,) and coefficients of a first frame; None where the shape is not found."""
         found = align(self.rig, data, start, fit_shape=True, config=self._config)
         mean, covariance = found.coefficients, found.coefficient_covariance
         shows = found.statuses[0] in (Status.CONVERGED, Status.MAX_STEPS, Status.DOUBTFUL)
@@ -81,22 +64,11 @@ class PersonFilter:
             return None
         return found.pose, KnownPerson(mean, covariance)
 
-    def learned(self, person: KnownPerson, data: Tensor, pose: Tensor, viewpoint: Tensor | None = None) -> KnownPerson:
-        """Return what is known of a person after another frame, which counts as independent of those before.
+    def update(self, person: KnownPerson, data: Tensor, pose: Tensor, viewpoint: Tensor | None = None) -> KnownPerson:
+        """Return the coefficients after another, independent frame (M, 3) with a fitted pose.
 
-        A frame is a least-squares problem in its pose and the coefficients,
-        ``|d(x, c)|^2_W + |x - x_0|^2_P + |c - m|^2_L``. Its solution is the new mean m, and the information L grows by
-        what the data tell of c whatever the pose, the Schur complement ``H_cc - H_cx (H_xx + P)^-1 H_xc``.
-
-        Args:
-            person: as known before.
-            data: (M, 3), metres.
-            pose: (num_dofs,) fitted to them.
-            viewpoint: (3,) of the camera, where it is known.
-
-        Differentiable: no.
-
-        References: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton.
+        The mean minimizes ``|d(x, c)|^2_W + |x - x_0|^2_P + |c - m|^2_L``; the information L grows by the Schur
+        complement ``H_cc - H_cx (H_xx + P)^-1 H_xc``. Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton.
         """
         dofs, tree = self.rig.num_dofs, self._skin.shape
         valid = torch.ones_like(data[:, 0], dtype=torch.bool)

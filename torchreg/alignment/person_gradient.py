@@ -25,23 +25,13 @@ _EXACTNESS = _Exactness()
 
 
 class PairedPlanes:
-    """Distances of data to the tangent planes of a rig's points, one for each datum.
-
-    Where the planes touch a smooth surface nearest to the data, the distances have its first derivatives, and its
-    second ones up to the product of distance and curvature.
-
-    Args:
-        skin: M points of the surface, with three corners each.
-    """
+    """Distances of data to the tangent planes of a rig's points, one for each datum, right to first order."""
 
     def __init__(self, skin: ShapedSkin) -> None:
         self.skin = skin
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Return the signed distances (B, M) of data (B, M, 3) in states (B, D + K), metres.
-
-        Differentiable: twice in both.
-        """
+        """Return the signed distances (B, M) of data (B, M, 3) in states (B, D + K), metres."""
         posed, normals = self.skin.oriented(pose)
         return ((points - posed) * normals).sum(-1)
 
@@ -54,21 +44,10 @@ class PairedPlanes:
 def person_with_gradients(
     shape: ArticulatedShape, fitted: FittedShape, points: Tensor, valid: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return pose (num_dofs,) and coefficients (K,) of a person fitted to one scan, with gradients in its points.
+    """Return pose (num_dofs,) and coefficients (K,) fitted to one scan (M, 3), with gradients in its points.
 
-    The last step's energy is stationary in pose and coefficients together; which point of the surface a datum belongs
-    to, and the widths, are held fixed. Gradients are those where it is exactly so, a few Newton steps from the fit,
-    whose numbers stay as they are. Variables at a limit have no gradient.
-
-    Args:
-        shape: the rig, with coefficients.
-        fitted: to the points.
-        points: (M, 3), metres.
-        valid: (M,) False where padded.
-
-    Differentiable: once, in the points.
-
-    Cost: three times that of `attach_gradients`, with num_dofs + K variables.
+    They are those of the stationary point a few Newton steps away; correspondences and widths are held fixed, and
+    variables at a limit have no gradient.
     """
     problem, state = fitted.problem, fitted.state
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Where a person of unknown size may stand: rough places and sizes of a rig with coefficients, without a start."""
+"""Global initialization of the pose and shape coefficients of a rig, and restarts of a single limb."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _PersonSearch:
     num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
     num_compared: int = 400  # best candidates, among which different ones are sought
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
-    same_swung: float = 0.03  # the same, of people of whom only one part differs
+    duplicate_limb_rms: float = 0.03  # the same, of states that differ in one limb only
     other: float = 0.05  # the same, of fitted people: what differs by more is a rival
     turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
     most_swung: float = 0.5  # of the surface: a limb that is more is not swung, as the rest would be
@@ -56,18 +56,10 @@ def find_people(
     generator: torch.Generator,
     upright: Direction | None = None,
 ) -> Tensor:
-    """Return states (count, D + K) of people that may be what a scan shows, the likeliest first.
+    """Return states (count, D + K) from a global search of pose and coefficients in a scan, best first.
 
-    People of all sizes, in evenly spread rotations or turned about the vertical, are registered rigidly to the scan,
-    and ranked by the data far from them and by how much of them is far from the data.
-
-    Args:
-        problem: of one scan.
-        rig: whose degrees of freedom a state begins with.
-        people: (S, K) coefficients.
-        count: of states, at most.
-        generator: of what is drawn.
-        upright: see `AlignConfig`.
+    Coefficients (S, K) in evenly spread or upright rotations are registered rigidly, and ranked by unexplained data and
+    surface.
     """
     turns = spread_rotations(_SEARCH.num_rotations) if upright is None else UprightRotations(upright).rotations(rig.up)
     rotations = so3_log(turns).to(people)
@@ -87,19 +79,8 @@ def find_people(
     return take_rows(best, order[:, :count])[0]
 
 
-def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return a person (D + K,) with one limb swung to where more of a scan is explained, (count, D + K), best first.
-
-    A limb that begins on the data of another does not leave them, and its own are left over. Each limb, with all that
-    hangs on it, is tried over the range of each of its joints, the others as the prior has them, those above it also as
-    they are; what explains data and is explained by them is ranked first, as in `find_people`.
-
-    Args:
-        problem: of one scan.
-        state: fitted; its size and the rest of its pose are kept.
-        count: of states, at most; none without limbs of less than half of the surface.
-        generator: of the data that are looked at.
-    """
+def limb_restarts(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return a state (D + K,) with one limb re-initialized over its joints' ranges, (count, D + K), best first."""
     rig, mean, size = problem.skin.shape.rig, problem.prior.mean[0], problem.size
     bodies, drawn = find_bodies(rig), problem.draw(_SEARCH.num_data, generator)
     skin = problem.skin.subset(farthest_points(problem.skin.points, min(_SEARCH.num_points, len(problem.skin))))
@@ -128,7 +109,7 @@ def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: to
     best = take_rows(torch.cat(swung, dim=1), torch.cat(costs, dim=1).argsort(1)[:, : _SEARCH.num_compared])
     # Those who hardly differ from the given one are duplicates of it.
     best = torch.cat([state[None, None], best], dim=1)
-    order = distinct_first(mean_distances(problem, best) < _SEARCH.same_swung * size)
+    order = distinct_first(mean_distances(problem, best) < _SEARCH.duplicate_limb_rms * size)
     return take_rows(best, order[:, 1 : 1 + count])[0]
 
 
@@ -139,15 +120,8 @@ def _with_joints(state: Tensor, bodies: Sequence[Body], values: Tensor) -> Tenso
     return moved
 
 
-def turned_people(problem: ShapeProblem, state: Tensor) -> Tensor:
-    """Return a person (D + K,) turned to both sides about each axis of space, joints as the prior has them, (6, D + K).
-
-    A person that leans explains one leg by the other, whose own data are left; no step leads upright from there.
-
-    Args:
-        problem: of one scan.
-        state: fitted; its size is kept.
-    """
+def rotation_restarts(problem: ShapeProblem, state: Tensor) -> Tensor:
+    """Return a state (D + K,) rotated to both sides about each axis, joints at the prior's mean, (6, D + K)."""
     num_dofs = problem.skin.shape.rig.num_dofs
     axes = torch.eye(3).to(state)
     turned = state.repeat(6, 1)
@@ -158,13 +132,7 @@ def turned_people(problem: ShapeProblem, state: Tensor) -> Tensor:
 
 
 def lead_over_rivals(problem: AlignProblem, states: Tensor, costs: Tensor) -> Tensor:
-    """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity.
-
-    Args:
-        problem: of one scan, in rows as the states.
-        states: fitted.
-        costs: (S,).
-    """
+    """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity."""
     best = int(costs.argmin())
     apart = mean_distances(problem, states.unsqueeze(0))[0, best] > _SEARCH.other * problem.size
     return torch.where(apart, costs, math.inf).amin().unsqueeze(0) - costs[best]

@@ -19,13 +19,7 @@ from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
 from torchreg.alignment.inputs import are_degenerate, check_clouds, check_skin
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.pose_proposer import PoseProposer, shipped_proposer
-from torchreg.alignment.problem import (
-    BROAD_PRIOR,
-    AlignProblem,
-    centered_problem,
-    masked_mean,
-    soft_inliers,
-)
+from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, centered_problem, masked_mean, soft_inliers
 from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, typical_poses
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
@@ -280,7 +274,7 @@ class PoseInitializer(nn.Module):
 
     @torch.no_grad()
     def _propose(self, proposer: PoseProposer, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `_find` does of what a network proposes; its prior draws joints to the most probable pose."""
+        """Return pose, prior mean and confidence from a network's proposals."""
         size = _BATCHING.cpu_proposed if data.device.type == "cpu" else _BATCHING.fitted
         typical = typical_poses(self.shape).mean(0)
         parts = []

@@ -70,15 +70,9 @@ class ProposerSize:
 
 
 class RawPoses(NamedTuple):
-    """Poses as a network gives them, the base as a rotation matrix.
+    """Poses as a network gives them: rotations (B, K, 3, 3), positions (B, K, 3), joints (B, K, J), and logits (B, K).
 
-    Args:
-        rotation: (B, K, 3, 3) of the base.
-        position: (B, K, 3) of the base, metres.
-        joints: (B, K, num_dofs - 6), within the limits.
-        logits: (B, K) of the poses' probabilities.
-        surface: (B, T, 4) where tokens lie on the shape at rest, as a share of its size, and the logit of an outlier.
-        token_index: (B, T) int64 points that are tokens.
+    `surface` (B, T, 4) is where tokens lie on the shape at rest, as a share of its size, and the logit of an outlier.
     """
 
     rotation: Tensor
@@ -91,14 +85,9 @@ class RawPoses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """What a network tells of clouds.
+    """Poses (B, K, num_dofs) of a network, most probable first, with weights (B, K).
 
-    Args:
-        poses: (B, K, num_dofs), most probable first.
-        weights: (B, K) their probabilities.
-        points: (B, T, 3) some of the data, metres.
-        surface: (B, T, 3) where they lie on the shape at rest, metres.
-        inlier: (B, T) probability that they lie on it at all.
+    Of the data (B, T, 3), metres, `surface` are the places on the shape at rest and `inlier` the probabilities.
     """
 
     poses: Tensor
@@ -323,10 +312,7 @@ def _drawn(values: Tensor, mask: Tensor, count: int) -> Tensor:
 
 
 def posed_points(raw: RawPoses, skin: LinearBlendSkin) -> Tensor:
-    """Return the points (B, K, N, 3) of a skin in proposed poses.
-
-    The base's rotation stays a matrix, as a rotation vector's gradient is singular at half a turn.
-    """
+    """Return the points (B, K, N, 3) of a skin in proposed poses, whose rotations stay matrices."""
     still = nn.functional.pad(raw.joints, (BASE_DOFS, 0))
     return skin(still) @ raw.rotation.mT + raw.position.unsqueeze(-2)
 
@@ -356,12 +342,7 @@ class HoldsProposer(Protocol):
 
 
 def check_proposer(shape: Articulation, initializer: PoseProposer | HoldsProposer) -> PoseProposer:
-    """Return a network that was given for a shape.
-
-    Raises:
-        InputError: if it proposes other degrees of freedom.
-        InputTypeError: if it is something else.
-    """
+    """Return a network that was given for a shape, checked."""
     proposer = initializer if isinstance(initializer, PoseProposer) else getattr(initializer, "proposer", initializer)
     if not isinstance(proposer, PoseProposer):
         raise InputTypeError(

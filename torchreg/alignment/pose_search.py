@@ -1,7 +1,4 @@
-"""From many rough candidate poses to a few good ones: what the search around a start and the one without share.
-
-Candidates are fitted coarsely, pruned with their limbs placed anew, and the best few refined thoroughly.
-"""
+"""From many rough candidates to a few good poses: fitted coarsely, pruned with limbs placed anew, and refined."""
 
 from __future__ import annotations
 
@@ -25,14 +22,7 @@ from torchreg.solvers.robust import welsch_loss
 
 @dataclass(frozen=True)
 class _Stage:
-    """Settings of a stage: placing limbs, fitting to the surface, scoring. Widths are shares of the model's size.
-
-    Args:
-        effort: of placing limbs.
-        fit_widths: of the kernel in the fits, one after the other.
-        fit_steps: at each width.
-        score_width: of the kernel by which a datum counts as explained.
-    """
+    """Settings of a stage: placing limbs, fitting to the surface, scoring. Widths are shares of the model's size."""
 
     effort: Effort
     fit_widths: tuple[float, ...]
@@ -76,12 +66,7 @@ SEARCH_BUDGET = _Budget()
 
 
 class PoseSearch:
-    """A search for the pose that explains most data, for a batch of problems of one shape.
-
-    Args:
-        problem: the batch; it is searched with few data, few model points and the shape's solids for its surface.
-        generator: draws data, the same for every problem: a batch gives what its problems give alone.
-    """
+    """A search, with few data and model points, for the poses that explain most data of a batch of problems."""
 
     def __init__(self, problem: AlignProblem, generator: torch.Generator) -> None:
         shape = problem.skin.shape
@@ -107,31 +92,16 @@ class PoseSearch:
         return score_candidates(self.problem, fitted, _REFINE.score_width)[:, 0]
 
     def fit_coarsely(self, pool: Tensor, steps: int) -> Tensor:
-        """Return rough candidates (B, N, num_dofs) after surface fits from a wide kernel to a narrow one, best first.
-
-        Data of one side only would draw an EM into the shape; the surface they do not. Duplicates of a better
-        candidate come last.
-        """
+        """Return candidates (B, N, num_dofs) after surface fits of narrowing kernels, best and different ones first."""
         fitted = fit_candidates(self.coarse_problem, pool, SEARCH_BUDGET.coarse_widths, steps)
         return self._best_first(fitted, score_candidates(self.coarse_problem, fitted, _PRUNE.score_width))
 
     def prune(self, pool: Tensor, count: int) -> Tensor:
-        """Return the best ``count`` of candidates (B, N, num_dofs), each with its limbs placed anew or as given.
-
-        Different ones first: where all rivals are duplicates, a symmetric shape would look certain.
-        """
+        """Return the best, different ``count`` of candidates (B, N, num_dofs), limbs placed anew or as given."""
         return self._best_first(*self._best_options(self.coarse_problem, pool, _PRUNE, 0))[:, :count]
 
     def refine(self, candidates: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
-        """Return candidates after a thorough search, best first, and their scores.
-
-        Args:
-            candidates: (B, H, num_dofs).
-            rounds: of the search; after the first, only the best candidate is searched on.
-
-        Returns:
-            poses (B, H, num_dofs) and scores (B, H): unexplained data, softly counted, and the prior.
-        """
+        """Return candidates (B, H, num_dofs) after a thorough search, best first, and their scores (B, H)."""
         poses, scores = self._best_options(self.problem, candidates, _REFINE, 1)
         order = scores.argsort(1)
         poses, scores = take_rows(poses, order), scores.gather(1, order)
@@ -156,10 +126,7 @@ class PoseSearch:
     def _best_options(
         self, problem: AlignProblem, candidates: Tensor, stage: _Stage, number: int
     ) -> tuple[Tensor, Tensor]:
-        """Return candidates (B, N, num_dofs) fitted with their limbs placed anew or as given, and scores (B, N).
-
-        Each round, by its number, places limbs on a draw of the data of its own.
-        """
+        """Return candidates (B, N, num_dofs) fitted with their limbs placed anew or as given, and scores (B, N)."""
         generator = torch.Generator().manual_seed(self.seed + number)
         wide = problem.repeated(candidates.shape[1])
         placed = self.limbs(wide, candidates.flatten(0, 1), stage.effort, generator).unflatten(0, candidates.shape[:2])

@@ -57,24 +57,9 @@ BROAD_PRIOR = BroadPrior()
 class AlignProblem:
     """A batch of alignments of one shape, the input of every stage.
 
-    Args:
-        skin: the model points.
-        surface: the surface that the surface fit fits.
-        data: (B, M, 3), metres, from the origin.
-        valid: (B, M) False where padded.
-        origin: (B, 3) in the world.
-        size: diagonal of the model in its rest pose, metres: the unit of all thresholds.
-        lower: limits of the pose, (num_dofs,) or (B, num_dofs).
-        upper: limits of the pose, (num_dofs,) or (B, num_dofs).
-        prior: on the joints.
-        pose_atol: largest change of a pose that counts as none.
-        outlier: "limit", "volume", or c.
-        debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
-        correspondence: one of `CORRESPONDENCES`.
-        free_space: what depth pictures say of where nothing is; None for clouds alone.
-        told_precision: (B, num_dofs) 1 / std^2 of what is known beforehand, zero where nothing is; None for nothing.
-        landmarks: measured keypoints, or None.
-        normals: (B, M, 3) of the data, which count beside positions in the EM; None where they do not.
+    Data (B, M, 3) in metres from the origins (B, 3); `size`, the diagonal of the model at rest, is the unit of all
+    thresholds; `debias` is the share of the kernel's shrinkage that is corrected in the targets of the EM; normals (B,
+    M, 3) of the data count in the EM.
     """
 
     skin: LinearBlendSkin
@@ -91,7 +76,7 @@ class AlignProblem:
     debias: float = 0.0
     correspondence: str = "em"
     free_space: FreeSpaceTerm | None = None
-    told_precision: Tensor | None = None
+    prior_precision: Tensor | None = None
     landmarks: Landmarks | None = None
     normals: Tensor | None = None
 
@@ -105,7 +90,7 @@ class AlignProblem:
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index], precision=_rows(self.prior.precision, index)),
-            told_precision=None if self.told_precision is None else self.told_precision[index],
+            prior_precision=None if self.prior_precision is None else self.prior_precision[index],
             free_space=None if self.free_space is None else self.free_space.rows(index),
             landmarks=None if self.landmarks is None else self.landmarks.rows(index),
             normals=None if self.normals is None else self.normals[index],
@@ -135,30 +120,21 @@ class AlignProblem:
         return replace(self, skin=skin, free_space=space)
 
     def plausible_limits(self, reach: float) -> tuple[Tensor, Tensor]:
-        """Return the limits (B, num_dofs) of the pose, narrowed to where what is known beforehand has it.
-
-        Args:
-            reach: about its mean, standard deviations.
-        """
+        """Return limits (B, num_dofs) of the pose, narrowed to ``reach`` standard deviations about the prior's mean."""
         lower, upper = (limit.expand_as(self.prior.mean) for limit in (self.lower, self.upper))
-        if self.told_precision is None:
+        if self.prior_precision is None:
             return lower, upper
-        width = reach * self.told_precision.rsqrt()
+        width = reach * self.prior_precision.rsqrt()
         low, high = self.prior.mean - width, self.prior.mean + width
         return torch.minimum(torch.maximum(low, lower), upper), torch.maximum(torch.minimum(high, upper), lower)
 
-    def at_most_told(self, std: Tensor) -> Tensor:
+    def cap_std_by_prior(self, std: Tensor) -> Tensor:
         """Return standard deviations (num_dofs,) as (B, num_dofs), none wider than what is known beforehand."""
         wide = std.expand_as(self.prior.mean)
-        return wide if self.told_precision is None else torch.minimum(wide, self.told_precision.rsqrt())
+        return wide if self.prior_precision is None else torch.minimum(wide, self.prior_precision.rsqrt())
 
     def solve(
-        self,
-        objective: Objective,
-        pose: Tensor,
-        max_steps: int,
-        around: Linearization,
-        damping: Tensor | None = None,
+        self, objective: Objective, pose: Tensor, max_steps: int, around: Linearization, damping: Tensor | None = None
     ) -> LMResult:
         """Return the result of Levenberg-Marquardt within the joint limits from a pose with a known linearization."""
         return levenberg_marquardt(
@@ -168,10 +144,7 @@ class AlignProblem:
         )  # fmt: skip
 
     def step(self, around: Linearization, pose: Tensor, damping: float = 1e-3) -> LMResult:
-        """Return the result of one damped step without a test: all that a generalized EM needs.
-
-        The default damping, that of an untried problem, suits an EM, whose objective changes with every E-step anyway.
-        """
+        """Return the result of one damped step without a test: all that a generalized EM needs."""
         shares = torch.full_like(pose[:, 0], damping)
         frozen = held_at_limits(around.gradient, pose, self.lower, self.upper)
         step, _ = damped_step(around, shares, frozen=frozen)
@@ -219,21 +192,9 @@ def centered_problem(
     free_space: FreeSpace | None = None,
     keypoints: MeasuredKeypoints | None = None,
 ) -> AlignProblem:
-    """Return a batch of alignments in coordinates with the origin of each cloud at zero, where float32 is precise.
+    """Return a batch of alignments with each cloud's origin (B, 3) at zero, where float32 is precise.
 
-    Args:
-        skin: the model points.
-        data: (B, M, 3), metres, in the world.
-        valid: (B, M) False where padded.
-        pose: (B, num_dofs) mean of the prior, in the world.
-        origin: (B, 3), as from `masked_mean`.
-        prior_std: see `AlignConfig`, like the settings below.
-        pose_atol: largest change of a pose that counts as none.
-        outlier: "limit", "volume", or c.
-        debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
-        correspondence: one of `CORRESPONDENCES`.
-        free_space: of the clouds, in the world, where they come from depth pictures.
-        keypoints: measured, in the world, if any.
+    Data (B, M, 3), free space, keypoints and the prior's mean ``pose`` (B, num_dofs) are given in the world.
     """
     shape, size = skin.shape, model_size(skin)
     shift = torch.nn.functional.pad(origin, (0, shape.num_dofs - 3))
@@ -290,16 +251,7 @@ def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
 def alignment_cost(
     problem: AlignProblem, pose: Tensor, distances: Tensor | None = None, intruding: Tensor | float | None = None
 ) -> Tensor:
-    """Return the cost (B,) by which alignments of the same data are ranked.
-
-    Outliers, softly counted, those that would be if the shape's points in free space were seen, and the prior.
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs).
-        distances: (B, M) of the data from the surface, where they are known.
-        intruding: (B,) the `free_space_loss` of width `INLIER_SHARE`, where it is known.
-    """
+    """Return the cost (B,) that ranks alignments: soft counts of outliers and of points in free space, and a prior."""
     intruding = free_space_loss(problem, pose, INLIER_SHARE) if intruding is None else intruding
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
@@ -313,13 +265,7 @@ def landmark_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor |
 
 
 def free_space_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:
-    """Return the data (B, ...), softly counted, that model points in free space stand for; zero for clouds alone.
-
-    Args:
-        problem: the batch.
-        pose: (B, ..., num_dofs).
-        width: of the kernel, as a share of the model's size.
-    """
+    """Return the data (B, ...), softly counted, that model points in free space stand for; ``width`` times the size."""
     if problem.free_space is None:
         return 0.0
     return problem.free_space.loss(problem.skin(pose), width * problem.size)

@@ -15,8 +15,8 @@ from torchreg.alignment.problem import INLIER_SHARE, model_size
 from torchreg.alignment.results import AlignResult
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.datasets.pose_labels import PoseLabel
+from torchreg.geometry.far_origin import to_local, to_world
 from torchreg.geometry.loaded import as_points
-from torchreg.shapes.pose_algebra import shifted
 
 
 def label_frames(
@@ -26,47 +26,30 @@ def label_frames(
     trusted: float = 0.5,
     start: Tensor | None = None,
 ) -> Iterator[PoseLabel]:
-    """Yield a label for each frame of a motion.
+    """Yield a `PoseLabel` for each frame of a motion, a cloud (M, 3) in metres or a depth frame, from the frame before.
 
-    A frame starts from the pose of the frame before. Where the confidence in that pose, or in the one it leads to, is
-    too low, the pose is searched for from scratch, and the one of higher confidence is kept.
-
-    Args:
-        initializer: of the shape.
-        frames: clouds (M, 3), metres; or depth frames, which are aligned with their free space, and labeled in the crop
-            that shows the shape.
-        trusted: least confidence in a pose that the next frame starts from.
-        start: (num_dofs,) of the first frame, if known.
-
-    Yields:
-        a `PoseLabel` per frame, in the coordinates of the clouds; in float64 where those of the first are far from the
-        origin.
-
-    Raises:
-        InputError: if ``trusted`` is negative or a cloud is empty or not finite.
-
-    Differentiable: no.
+    Where the confidence is below ``trusted`` the pose is searched from scratch, and the more confident one is kept.
     """
     check_positive(trusted, "trusted", allow_zero=True)
     origin, is_first = None, True
     for frame in frames:
         if is_first:
             origin, is_first = floating_origin(initializer.shape, as_points(frame)), False
-            start = start if start is None or origin is None else shifted(start.double(), -origin)
+            start = to_local(start, origin)
         with torch.no_grad():
-            if isinstance(frame, DepthFrame):
-                near = frame if origin is None else frame.near(origin)
+            near = to_local(frame, origin)
+            if isinstance(near, DepthFrame):
                 crop, found = _pose_in_picture(initializer, near, start, trusted)
                 points = crop.points.to(initializer.shape.rest)
             else:
-                points = (frame if origin is None else frame.double() - origin).to(initializer.shape.rest)
+                points = near.to(initializer.shape.rest)
                 found = _pose_of(initializer, points, start, trusted)
             parts = _part_labels(initializer, points, found.pose)
         start = found.pose if float(found.confidence) >= trusted else None
         label = PoseLabel(
             points=points, pose=found.pose, keypoints=found.keypoints, parts=parts, confidence=found.confidence
         )
-        yield label if origin is None else label.moved(origin)
+        yield to_world(label, origin)
 
 
 def _pose_of(initializer: PoseInitializer, points: Tensor, start: Tensor | None, trusted: float) -> InitialPose:

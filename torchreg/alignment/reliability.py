@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clusters_beside
-from torchreg.alignment.confidence import EVIDENCE, DataOnSurface, end_spreads, limb_points, share_beside
+from torchreg.alignment.confidence import EVIDENCE, SurfaceResiduals, end_spreads, limb_points, near_outlier_share
 from torchreg.alignment.curvature import curvature, plausible_precision
 from torchreg.alignment.observability import dof_confidence, far_variance, told_open
 from torchreg.alignment.other_explanations import open_rims, planes_instead
@@ -25,19 +25,18 @@ from torchreg.shapes.limbs import Limb
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What speaks for or against poses, (B,) each, from 0 (good) to about 1.
+    """Evidence against poses, (B,) each, from 0 (good) to about 1.
 
     Args:
         noise: of the data about the surface, from the least (0) to the largest (1) that a fit assumes, in logarithms.
-        beside: root of the share of the data that lie beside the surface, not far.
+        beside: root of the share of near outliers.
         clusters: root of the data in dense clusters off the surface, as a share of those on it.
         off: share of the data that are not on the surface.
-        free_space: root of the data that the shape's points in free space stand for, as a share of the data.
-        unknown: probability that the data do not tell where the limbs end.
-        rival: how near the second-best pose of a search comes, 0 for a start that was given.
-        rival_share: the same, relative to the number of data.
-        open_rim: square of `open_rims`, as a little of it is usual; zero for clouds.
-        planes: square of `planes_instead`, as for the rim.
+        free_space: root of the data that points in free space stand for, as a share of the data.
+        unknown: probability that the data do not determine the ends of the limbs.
+        rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
+        open_rim: square of `open_rims`; zero for clouds.
+        planes: square of `planes_instead`.
     """
 
     noise: Tensor
@@ -97,13 +96,7 @@ SHAPE_CALIBRATION = Calibration(
 
 @dataclass(frozen=True)
 class SurfaceError:
-    """Standard errors of the surface of a fit of pose and shape together, by their joint covariance.
-
-    Args:
-        whole: (B,) root mean square over the surface, metres.
-        parts: (B, P) the same over each part, zero where it has no points.
-        moved: (B,) root mean square by which the fit's last step moved the surface, metres.
-    """
+    """Standard errors (B,) of a surface fitted with its coefficients, of parts (B, P), and its last motion, metres."""
 
     whole: Tensor
     parts: Tensor
@@ -125,13 +118,7 @@ class SurfaceError:
 
 
 def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> AlignProblem:
-    """Return a problem without the data that a crop cuts off, as a forearm: they speak neither for nor against a pose.
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        frames: whose points the data are, in their order; others stay.
-    """
+    """Return a problem without the data that a crop cuts off, such as a forearm, in fitted poses (B, num_dofs)."""
     if len(frames) != len(pose):
         return problem
     distance = problem.surface.distance(problem.data, pose)
@@ -146,15 +133,9 @@ def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What can be trusted of fitted poses.
+    """Covariance (B, D, D) in tangent coordinates, evidence, confidence (B,) and doubts of fitted poses.
 
-    Args:
-        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
-        dof_confidence: (B, num_dofs) share of the variance without data that they removed.
-        converged: (B,) whether a further step would hardly matter.
-        evidence: for and against them.
-        confidence: (B,) that they are right.
-        doubt: what is doubtful, a sentence each, empty where nothing is.
+    `dof_confidence` (B, D) is the share of the variance without data that the data removed.
     """
 
     covariance: Tensor
@@ -172,20 +153,12 @@ def judge(
     error: SurfaceError | None = None,
     frames: Sequence[DepthFrame] = (),
 ) -> Judgement:
-    """Return what can be trusted of poses (B, num_dofs).
-
-    Args:
-        problem: the batch.
-        pose: fitted.
-        lead: see `gather_evidence`.
-        error: of fits of pose and shape together.
-        frames: whose points the data are.
-    """
-    lying = DataOnSurface.of(problem, pose)
-    around, spreads = curvature(problem, pose, lying), end_spreads(problem, pose, lying)
-    evidence, calibration = gather_evidence(problem, pose, lying.distance, lead, spreads), CALIBRATION
+    """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`."""
+    residuals = SurfaceResiduals.of(problem, pose)
+    around, spreads = curvature(problem, pose, residuals), end_spreads(problem, pose, residuals)
+    evidence, calibration = gather_evidence(problem, pose, residuals.distance, lead, spreads), CALIBRATION
     if frames:
-        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, lying.distance)
+        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, residuals.distance)
         evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
     converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
     if error is not None:
@@ -193,7 +166,7 @@ def judge(
         limbs = [limb for limb, _ in limb_points(problem.skin)]
         converged, loose = error.converged, error.loose(limbs, problem.size)
     shape, precision = problem.skin.shape, plausible_precision(problem, pose)
-    far = far_variance(problem, pose, lying, noise=around.noise, shared=around.shared, precision=precision)
+    far = far_variance(problem, pose, residuals, noise=around.noise, shared=around.shared, precision=precision)
     diagonal = around.covariance.diagonal(dim1=-2, dim2=-1)
     covariance = around.covariance + torch.diag_embed((far - diagonal).clamp_min(0))
     left_open = [told_open(shape, row, problem.size) for row in covariance]
@@ -204,7 +177,8 @@ def judge(
         evidence=evidence,
         confidence=confidence_of(evidence.table(), calibration),
         doubt=tuple(
-            "; ".join(filter(None, row)) for row in zip(told_doubts(problem, evidence, loose), left_open, strict=True)
+            "; ".join(filter(None, row))
+            for row in zip(doubt_messages(problem, evidence, loose), left_open, strict=True)
         ),
     )
 
@@ -212,21 +186,15 @@ def judge(
 def gather_evidence(
     problem: AlignProblem, pose: Tensor, distance: Tensor, lead: Tensor | None, spreads: Tensor
 ) -> Evidence:
-    """Return the evidence for poses (B, num_dofs).
+    """Return the evidence for poses (B, num_dofs), with distances (B, M) of the data and `end_spreads` (B, L).
 
-    Args:
-        problem: the batch.
-        pose: fitted.
-        distance: (B, M) of the data from the surface.
-        lead: (B,) cost by which the second best pose of a search was worse, infinite where there was none; None for
-            starts that were given.
-        spreads: (B, L), see `end_spreads`.
+    ``lead`` (B,) is the cost by which the second-best pose of a search was worse; None for given starts.
     """
     clustered, on_surface = clusters_beside(problem, distance)
     return weigh(
         problem,
         distance,
-        beside=share_beside(problem, distance),
+        beside=near_outlier_share(problem, distance),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
         spread=spreads.mean(-1),
         intruding=free_space_loss(problem, pose, INLIER_SHARE),
@@ -244,17 +212,7 @@ def weigh(
     intruding: Tensor | float,
     lead: Tensor | None = None,
 ) -> Evidence:
-    """Return the evidence for poses, of which the costly part is known.
-
-    Args:
-        problem: the batch.
-        distance: (B, M) of the data from the surface.
-        beside: (B,) share of the data beside the surface, see `beside_share`.
-        clustered: (B,) data in clusters, as a share of those on the surface.
-        spread: (B,) mean of `end_spreads`, metres.
-        intruding: (B,) the `free_space_loss` of width `INLIER_SHARE`.
-        lead: see `gather_evidence`.
-    """
+    """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,)."""
     noise = surface_noise(distance, problem.valid, problem.size)
     least = SURFACE_FIT.min_noise(problem.size)
     count = problem.valid.sum(-1).clamp_min(1).to(distance)
@@ -280,14 +238,8 @@ def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> T
     return torch.sigmoid(calibration.bias - evidence @ evidence.new_tensor(calibration.weights))
 
 
-def told_doubts(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
-    """Return what is doubtful about poses, a sentence each, empty where nothing is.
-
-    Args:
-        problem: the batch.
-        evidence: for its poses.
-        loose: (B, L) limbs whose ends the data hardly show.
-    """
+def doubt_messages(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
+    """Return the doubts about poses, a sentence each, empty where there is none; loose (B, L) limbs are named."""
     limbs = [limb for limb, _ in limb_points(problem.skin)]
     sentences = []
     for row, loose_limbs in enumerate(loose.tolist()):

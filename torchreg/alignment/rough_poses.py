@@ -49,13 +49,7 @@ class PoseSource(Protocol):
 
 @dataclass(frozen=True)
 class UniformRotations:
-    """A `PoseSource`: evenly spread rotations of typical poses, at the median of the data.
-
-    Args:
-        count: of rotations, per typical pose.
-
-    References: Alexa 2022, super-Fibonacci spirals.
-    """
+    """A `PoseSource`: evenly spread rotations of typical poses, at the median of the data."""
 
     count: int = 200
 
@@ -87,14 +81,7 @@ class PrincipalAxes:
 
 @dataclass(frozen=True)
 class UprightRotations:
-    """A `PoseSource`: typical poses of a shape that stands upright, turned about the vertical.
-
-    They are put at the median of the data. A fit may lean afterwards.
-
-    Args:
-        up: (3,) what is upright in the data; in the shape it is `ArticulatedShape.up`.
-        count: of rotations, per typical pose; 30 degrees apart, as those of `UniformRotations`.
-    """
+    """A `PoseSource`: typical poses turned about the vertical ``up`` of the data, at their median."""
 
     up: Direction
     count: int = 12
@@ -133,10 +120,7 @@ def bent_pose(shape: Articulation, share: float) -> Tensor:
 
 
 def spread_rotations(count: int) -> Tensor:
-    """Return ``count`` rotation matrices (count, 3, 3), float64, spread evenly over all rotations.
-
-    References: Alexa 2022, super-Fibonacci spirals.
-    """
+    """Return ``count`` rotation matrices (count, 3, 3), float64, spread evenly: super-Fibonacci spirals, Alexa 2022."""
     index = torch.arange(count, dtype=torch.float64) + 0.5
     inner, outer = (index / count).sqrt(), (1 - index / count).sqrt()
     first, second = (2 * math.pi * index / step for step in _SPIRAL_STEPS)
@@ -166,10 +150,7 @@ def _at_data_median(problem: AlignProblem, poses: Tensor) -> Tensor:
 
 
 def register_rigidly(problem: AlignProblem, poses: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return poses (B, K, num_dofs) after a rigid EM of a few model points to drawn data, and their costs (B, K).
-
-    Wide kernels first; the joints stay. A batch of closed-form M-steps costs less than one step of the joints.
-    """
+    """Return poses (B, K, num_dofs) after a rigid EM of a few model points to drawn data, and their costs (B, K)."""
     skin, size = problem.skin, problem.size
     drawn = problem.draw(_RIGID_EM.num_data, generator)
     points = skin(poses)[..., farthest_points(skin.points, min(_RIGID_EM.num_points, len(skin))), :]

@@ -32,14 +32,7 @@ SCALE_FIT = ScaleFit()
 
 @dataclass(frozen=True)
 class ScalePrior:
-    """Gaussians on the joints of all frames and on the scales.
-
-    Args:
-        poses: (T, num_dofs) means.
-        pose_precision: (num_dofs,), zero for the base.
-        scales: (2 P,) means, lengths before radii.
-        scale_precision: (2 P, 2 P).
-    """
+    """Gaussians on poses (T, num_dofs), precision (num_dofs,), and scales (2 P,), lengths first, (2 P, 2 P)."""
 
     poses: Tensor
     pose_precision: Tensor
@@ -87,26 +80,12 @@ class ScalePrior:
 class ScaleProblem:
     """The poses of all frames and the scales of the shape as one least-squares problem.
 
-    A state is one row: the poses of all frames, then lengths and radii. The shape carries the scales of the last state
-    that was evaluated.
-
-    Args:
-        shape: changed in place.
-        data: (T, M, 3), metres.
-        valid: (T, M).
-        prior: on poses and scales.
-        size: of the shape, metres.
-        max_points: data per frame that count; drawn evenly from frames with more.
+    A state is one row: the poses of all frames, lengths, radii. The shape carries the scales of the last state
+    evaluated. At most ``max_points`` of each frame's data (T, M, 3) count.
     """
 
     def __init__(
-        self,
-        shape: ArticulatedShape,
-        data: Tensor,
-        valid: Tensor,
-        prior: ScalePrior,
-        size: float,
-        max_points: int,
+        self, shape: ArticulatedShape, data: Tensor, valid: Tensor, prior: ScalePrior, size: float, max_points: int
     ) -> None:
         self.shape, self.size = shape, size
         # Strides rather than draws: frames are in no order that matters, and the result is the same every time.
@@ -180,18 +159,7 @@ class ScaleProblem:
 
 
 def scale_jacobian(shape: Articulation, points: Tensor, poses: Tensor) -> Tensor:
-    """Return the Jacobian of the fused distance with respect to the logarithms of all lengths and radii.
-
-    Args:
-        shape: the articulated shape.
-        points: (T, M, 3), metres.
-        poses: (T, num_dofs).
-
-    Returns:
-        (T, M, 2 P), lengths before radii.
-
-    Differentiable: no; it is a derivative already.
-    """
+    """Return the Jacobian (T, M, 2 P) of the fused distances at (T, M, 3) by the logarithms of lengths, then radii."""
     solids = shape.primitives
     centers, rotations, moves = _solid_motions(shape, poses)
     local = ((points.unsqueeze(-2) - centers.unsqueeze(1)).unsqueeze(-2) @ rotations.unsqueeze(1)).squeeze(-2)
@@ -214,10 +182,7 @@ def scale_jacobian(shape: Articulation, points: Tensor, poses: Tensor) -> Tensor
 
 
 def _solid_motions(shape: Articulation, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return centers (T, P, 3) and rotations (T, P, 3, 3) of the solids, and motions of the centers (T, P, 3, P).
-
-    The motions, by the logarithms of all lengths, are in each solid's own frame.
-    """
+    """Return the solids' centers (T, P, 3), rotations, and motions (T, P, 3, P) by log lengths in their own frames."""
     frames = shape.frame_transforms(poses)
     turns, origins = frames[:, shape.part_index, :3, :3], frames[:, shape.part_index, :3, 3]
     centers = shape.primitives.centers * shape.log_length_scales.exp().unsqueeze(-1)

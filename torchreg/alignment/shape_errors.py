@@ -1,4 +1,4 @@
-"""What a shape that is not quite the measured one does to a pose: a covariance beside that of the noise."""
+"""Model-error ("consider") covariance of a pose, in addition to that of the noise."""
 
 from __future__ import annotations
 
@@ -21,32 +21,13 @@ def shape_covariance(
     covariance: Tensor,
     share: Tensor,
 ) -> Tensor | float:
-    """Return by how much what is wrong with a shape of solids may have moved its pose; zero for exact surfaces.
+    """Return the "consider" covariance (B, D, D) of a pose by errors of a shape of solids; zero for meshes.
 
-    The logarithms of the parts' lengths and radii are parameters that the fit left out: those of the measured thing
-    differ by ``s``. With weighted Jacobians ``J`` by the pose and ``S`` by the scales, and the fit's covariance ``C``,
-    that moves the pose by ``-G s``, ``G = C J^T S``, and leaves the residuals ``(S - J G) s``. If the scales differ
-    independently by a standard deviation ``tau``, the pose's covariance is ``tau^2 G G^T``; ``tau`` is that of which
-    such residuals are as large as what neighboring ones share, which noise does not.
-
-    And the surface as a whole may lie too far in or out, as solids fuse more or less and skin is thick or thin. Seen
-    from one side such an offset moves the pose and leaves no residual, so its standard deviation is what a model is not
-    exact, `SURFACE_FIT.min_noise`, 0.3 mm of a hand. (Of the hands of ``benchmarks/confidence.py --calibrate``
-    the likelihood of the true poses is largest at 0.25 to 0.3 mm.)
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        distance: (B, M) of the data from the surface, metres.
-        jacobian: (B, M, num_dofs) of the distances by the pose.
-        factor: (B, M) by which distances count: roots of their weights, in 1 / noise.
-        covariance: (B, num_dofs, num_dofs) of the fit, each datum counted as independent.
-        share: (B,) of the variance of residuals that neighbors share.
-
-    Returns:
-        (B, num_dofs, num_dofs), float64.
-
-    References: Schmidt 1966, the "consider" covariance of parameters that are not estimated.
+    Scales off by s move the pose by ``-G s``, ``G = C J^T S``, and leave residuals ``(S - J G) s``; C is the covariance
+    of the fit, J and S its weighted Jacobians by pose and scales. With a standard deviation tau of the scales the
+    covariance is ``tau^2 G G^T``; tau is estimated from the ``share`` (B,) of the residuals' variance that neighbors
+    share (Schmidt 1966). The whole surface may also be offset by `SURFACE_FIT.min_noise`, which leaves no residual from
+    one side: of the hands of ``benchmarks/confidence.py --calibrate`` the true poses are likeliest at 0.25 to 0.3 mm.
     """
     if not isinstance(problem.surface, FusedSurface):
         return 0.0

@@ -15,13 +15,8 @@ from torchreg.alignment.clusters import leaves_clusters
 from torchreg.alignment.confidence import EVIDENCE, end_variances
 from torchreg.alignment.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.person_search import find_people, lead_over_rivals, swung_people, turned_people
-from torchreg.alignment.problem import (
-    BROAD_PRIOR,
-    joint_precision,
-    masked_mean,
-    model_size,
-)
+from torchreg.alignment.person_search import find_people, lead_over_rivals, limb_restarts, rotation_restarts
+from torchreg.alignment.problem import BROAD_PRIOR, joint_precision, masked_mean, model_size
 from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.shape_problem import ShapeProblem
@@ -72,19 +67,10 @@ SHAPE_FIT = ShapeFit()
 
 @dataclass(frozen=True)
 class FittedShape:
-    """Poses and coefficients at the end of a fit.
+    """Poses (T, D) and coefficients (K,) of a fit, with covariances (T, D + K, D + K) in tangent coordinates.
 
-    Args:
-        poses: (T, num_dofs) of the scans.
-        coefficients: (K,).
-        covariance: (T, num_dofs + K, num_dofs + K), of pose and coefficients in tangent coordinates.
-        cost: () by which people are ranked.
-        sigma: (1,) last width of the annealed EM, metres.
-        change: (1,) of the last step.
-        error: standard errors of the surface in each scan.
-        problem: that was solved, about the scans' means.
-        state: (T, D + K) its solution.
-        lead: (1,) cost by which the best of different people is worse, of a search without a start; else None.
+    `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
+    state is worse in a search.
     """
 
     poses: Tensor
@@ -100,16 +86,7 @@ class FittedShape:
 
 
 def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = True) -> ArticulatedShape:
-    """Return the rig whose coefficients are to be fitted.
-
-    Args:
-        shape: with coefficients of its own, or a mesh.
-        fit_shape: True for those coefficients, "bones" for lengths and radii of its parts.
-        plain: whether nothing is asked for beside them.
-
-    Raises:
-        InputError: if it has none, or more is asked for.
-    """
+    """Return the rig whose coefficients are to be fitted; not ``plain`` is what has other options as well."""
     if fit_shape is not True and fit_shape != "bones":
         raise InputError(f"fit_shape must be True, False or 'bones', got {fit_shape!r}")
     if not plain:
@@ -132,21 +109,10 @@ def fit_coefficients(
     viewpoints: Tensor | None = None,
     on_step: OnStep | None = None,
 ) -> FittedShape:
-    """Return the poses of T scans of one person and the coefficients that they share.
+    """Return the poses of T scans (T, M, 3) of one shape and the coefficients that they share.
 
-    Annealed EM, in which normals count beside positions, registers people of different sizes; the best are fitted to
-    the surface. Coefficients are further columns of the same normal equations as the pose.
-
-    Args:
-        shape: a rig with coefficients and a mesh.
-        data: (T, M, 3), metres.
-        valid: (T, M) False where padded.
-        poses: (T, num_dofs) to start from, of the rig at its mean coefficients; None to search for one scan's.
-        config: of the alignment.
-        viewpoints: (T, 3) of the cameras, where they are known.
-        on_step: called after each iteration.
-
-    Differentiable: no.
+    Annealed EM, with normals, registers shapes of different sizes; the best are fitted to the surface, coefficients as
+    further columns of the normal equations. Poses (T, num_dofs) are at the mean coefficients; None searches one scan's.
     """
     generator = torch.Generator().manual_seed(config.seed)
     problem, start = _problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
@@ -181,10 +147,7 @@ def fit_coefficients(
 
 
 def _placed_again(problem: ShapeProblem, state: Tensor, descend: _Descent) -> Tensor:
-    """Return states (B, D + K) after another, narrower annealing, where that explains more of the data.
-
-    Once size and trunk are right, limbs that the first annealing put on the wrong data find theirs.
-    """
+    """Return states (B, D + K) after another, narrower annealing, where that explains more of the data."""
     found = descend(problem, state, _narrow(problem))
     better = problem.cost_of_people(found) < problem.cost_of_people(state)
     return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
@@ -193,18 +156,15 @@ def _placed_again(problem: ShapeProblem, state: Tensor, descend: _Descent) -> Te
 def _explained_anew(
     problem: ShapeProblem, state: Tensor, descend: _Descent, generator: torch.Generator, *, searched: bool
 ) -> Tensor:
-    """Return people (B, D + K) in one scan, the best of them with a part swung, where clusters of data are left over.
-
-    One that was searched is turned as a whole, too.
-    """
+    """Return states (B, D + K) in one scan, the best with one limb re-initialized where clusters are left over."""
     costs = problem.cost_of_people(state)
     best = costs.argmin().unsqueeze(0)
     one = problem.rows(best)
     if not bool(leaves_clusters(one, state[best])):
         return state
-    others = [(swung_people(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
+    others = [(limb_restarts(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
     if searched:
-        others.append((turned_people(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
+        others.append((rotation_restarts(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
     # A chain without branches has no limb to swing.
     others = [(start, widths) for start, widths in others if len(start)]
     if not others:
@@ -223,12 +183,7 @@ def _narrow(problem: ShapeProblem) -> SigmaSchedule:
 
 @dataclass(frozen=True)
 class _Descent:
-    """Annealed EM, then a coarse fit to the surface.
-
-    Args:
-        config: of the alignment.
-        on_step: called after each iteration.
-    """
+    """Annealed EM, then a coarse fit to the surface."""
 
     config: AlignConfig
     on_step: OnStep | None
@@ -243,13 +198,10 @@ class _Descent:
 def _with_learned_spread(
     problem: ShapeProblem, state: Tensor, alike: Tensor, on_step: OnStep | None
 ) -> tuple[ShapeProblem, Tensor]:
-    """Return the problem of one person with the deviations of alike coefficients learned, and states (T, D + K) fitted.
+    """Return the problem with the deviations of alike coefficients learned, and states (T, D + K) fitted.
 
-    The deviation of the greatest evidence has ``s^2 = sum_k (c_k - m_k)^2 / sum_k g_k`` over coefficients k, where
-    ``g_k = 1 - C_kk / s^2`` is the share of each that the data tell and C the covariance. The guess of the prior counts
-    as one more coefficient.
-
-    References: MacKay 1992, Bayesian interpolation, eq. 4.9.
+    The deviation of greatest evidence is ``s^2 = sum_k (c_k - m_k)^2 / sum_k g_k``, ``g_k = 1 - C_kk / s^2`` with the
+    covariance C (MacKay 1992, eq. 4.9); the prior's guess counts as one more coefficient.
     """
     space, dofs = problem.skin.shape.space, problem.skin.shape.rig.num_dofs
     member = alike.unsqueeze(-1) == alike.clamp_min(0).unique()
@@ -269,12 +221,7 @@ def _with_learned_spread(
 
 
 def shared_covariance(covariance: Tensor, num_dofs: int) -> Tensor:
-    """Return the covariance (K, K) of coefficients from those of scans, each alone with its share of the prior.
-
-    Args:
-        covariance: (T, D + K, D + K).
-        num_dofs: D.
-    """
+    """Return the covariance (K, K) of coefficients from scans' (T, D + K, D + K), each with its prior's share."""
     alone = covariance[:, num_dofs:, num_dofs:].double()
     return torch.linalg.inv(torch.linalg.inv(alone).sum(0)).to(covariance)
 
@@ -322,14 +269,9 @@ def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RobustRows:
-    """Data as rows of a least-squares problem in states.
+    """Distances (B, M) in metres, Jacobian (B, M, D + K) and Welsch weights of data as rows of a least-squares problem.
 
-    Args:
-        distance: (B, M) of the data from the surface, metres.
-        jacobian: (B, M, D + K) of the distances.
-        weights: (B, M) from 0 to 1, of the Welsch kernel at the noise.
-        noise: (B,) standard deviation of each datum as if all were independent, metres: larger where neighbors err
-            together.
+    `noise` (B,) is the deviation of each datum as if all were independent: larger where neighbors err together.
     """
 
     distance: Tensor
@@ -339,15 +281,7 @@ class RobustRows:
 
 
 def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor, size: float) -> RobustRows:
-    """Return data (B, M, 3) as rows of a least-squares problem in states (B, D + K).
-
-    Args:
-        surface: of the rig.
-        data: metres.
-        valid: (B, M) False where padded.
-        state: poses and coefficients.
-        size: of the rig, metres.
-    """
+    """Return data (B, M, 3) as rows of a least-squares problem in states (B, D + K) of poses and coefficients."""
     distance, jacobian = surface.distance_jacobian(data, state)
     noise = surface_noise(distance, valid, size)
     near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * valid
@@ -362,12 +296,7 @@ def plausible_precision(rig: Articulation, size: float, precision: Tensor) -> Te
 
 
 def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
-    """Return coefficients (S, K) of people of evenly spread sizes, of each size the most plausible of many drawn.
-
-    Args:
-        space: of rest states.
-        generator: of the draws.
-    """
+    """Return coefficients (S, K) of evenly spread sizes, of each size the most plausible of many drawn."""
     count = SHAPE_FIT.num_draws - SHAPE_FIT.num_draws % SHAPE_FIT.num_starts
     noise = torch.randn(count, len(space), generator=generator, dtype=torch.float64).to(space.mean)
     drawn = torch.minimum(torch.maximum(space.mean + noise * space.std, space.lower), space.upper)
@@ -419,11 +348,7 @@ def _problem(
 
 
 def _found(
-    problem: ShapeProblem,
-    rig: ArticulatedShape,
-    people: Tensor,
-    generator: torch.Generator,
-    upright: Direction | None,
+    problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator, upright: Direction | None
 ) -> tuple[ShapeProblem, Tensor]:
     """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
     one = problem.rows(torch.zeros(1, dtype=torch.int64)).sample(SHAPE_FIT.coarse_data, generator)
@@ -432,13 +357,7 @@ def _found(
 
 
 def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:
-    """Return states (S T, D + K) of people (S, K) in poses (T, D), with their middle where the mean's is.
-
-    Args:
-        poses: of the rig at its mean.
-        people: coefficients.
-        offsets: (S, 3) of the mean's middle from theirs, at rest, metres.
-    """
+    """Return states (S T, D + K) of coefficients (S, K) in poses (T, D), with their middle where the mean's is."""
     moved = (so3_exp(poses[:, 3:6]) @ offsets[:, None, :, None]).squeeze(-1)
     placed = poses + pad(moved, (0, poses.shape[-1] - 3))
     shared = people.unsqueeze(1).expand(-1, len(poses), -1)

@@ -22,13 +22,7 @@ from torchreg.solvers.levenberg_marquardt import (
 
 @dataclass(frozen=True)
 class ShapeProblem(AlignProblem):
-    """Alignments whose degrees of freedom end with shape coefficients, which successive rows may share.
-
-    Args:
-        skin: model points, of a `ShapedTree`.
-        surface: the surface that the surface fit fits.
-        scans: rows, one after another, of one person.
-    """
+    """Alignments whose degrees of freedom end with shape coefficients, shared by successive rows, ``scans`` each."""
 
     skin: ShapedSkin  # type: ignore[assignment]
     surface: ShapedSurface
@@ -64,12 +58,7 @@ class ShapeProblem(AlignProblem):
         return alignment_cost(self, state).unflatten(0, (-1, self.scans)).sum(-1)
 
     def solve(
-        self,
-        objective: Objective,
-        pose: Tensor,
-        max_steps: int,
-        around: Linearization,
-        damping: Tensor | None = None,
+        self, objective: Objective, pose: Tensor, max_steps: int, around: Linearization, damping: Tensor | None = None
     ) -> LMResult:
         """Return the result of Levenberg-Marquardt, see `AlignProblem.solve`, with coefficients shared."""
         if self.scans == 1:

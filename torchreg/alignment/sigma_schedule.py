@@ -100,22 +100,10 @@ class SigmaSchedule:
 
 
 def estimate_sigma(matches: EStep, before: Tensor, after: Tensor) -> Tensor:
-    """Return the sigma that the M-step of a conventional EM estimates from the points that it moved.
+    """Return the sigma (...) that the M-step of a conventional EM estimates from the points (..., N, 3) that it moved.
 
-    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)`` with the posterior of the E-step and the moved
-    points, as in Coherent Point Drift. Zero where all data are outliers.
-
-    Args:
-        matches: the E-step at ``before``.
-        before: (..., N, 3) model points that the E-step saw, metres.
-        after: (..., N, 3) the same points after the M-step, metres.
-
-    Returns:
-        (...), metres.
-
-    Differentiable: in ``before`` and ``after``.
-
-    References: Dewaele et al. 2006, section 3.3; Myronenko and Song 2010.
+    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)``, zero without inliers. Dewaele et al. 2006,
+    3.3.
     """
     decrease = (before - matches.targets).square().sum(-1) - (after - matches.targets).square().sum(-1)
     squares = matches.squared_error - (matches.weights * decrease).sum(-1)

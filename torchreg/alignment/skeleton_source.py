@@ -111,14 +111,7 @@ class SpineLimbs:
 
 @dataclass(frozen=True, eq=False)
 class _Chains:
-    """Points along the K chains of a shape, from the tips inwards; shorter chains repeat their last point.
-
-    Args:
-        parts: (K, S) part that each point is fixed to.
-        offsets: (K, S, 3) of the points in the coordinates of their parts.
-        lengths: (K, S) of the bones from the tip.
-        weights: (K, S) zero for repeated points.
-    """
+    """S points along the K chains of a shape, from the tips inwards; repeats of the last point have weight 0."""
 
     parts: Tensor
     offsets: Tensor
@@ -165,10 +158,7 @@ def _chain_points(skin: LinearBlendSkin, parts: list[int]) -> tuple[list[int], T
 
 
 def _rigidly_mapped(typical: Tensor, known: Tensor, limbs: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a typical pose moved rigidly to the limbs that a mapping (K,) names, and the targets (K, S, 3).
-
-    Targets are NaN where a chain has no limb.
-    """
+    """Return a typical pose moved rigidly to the limbs of a mapping (K,), and targets (K, S, 3), NaN without a limb."""
     has_limb = row >= 0
     target = limbs[row.clamp_min(0), torch.arange(len(row))].to(known)
     weights = has_limb.to(known)[:, None].expand(known.shape[:2]).flatten()

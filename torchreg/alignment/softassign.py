@@ -26,33 +26,13 @@ def softassign(
     sweeps: int = 100,
     tolerance: float = 1e-3,
 ) -> EStep:
-    """Return lambda_i, G_i and the total match of every datum under one-to-one soft assignment.
+    """Return lambda_i, G_i and the total match of every datum under one-to-one soft assignment, as an E-step.
 
-    The matrix ``m_ij = u_i exp(-|Y_j - X_i|^2 / 2 sigma^2) v_j`` is normalized in turn along its rows and its columns
-    (Sinkhorn), each with one more entry for "no partner": ``sum_j m_ij + b u_i = 1`` and ``sum_i m_ij + c v_j = 1``.
-    The extra row and column themselves are not normalized, since many points may have no partner. Only the product of b
-    and c matters. Unlike in `expectation` a model point matches one datum at most; before the first sweep the two are
-    the same. The extra entries bound u by 1 / b and v by 1 / c, so that products of plain numbers neither overflow nor
-    divide by zero, at any sigma.
-
-    Args:
-        model: (..., N, 3) posed model points, metres.
-        data: (..., M, 3), metres, with batch dimensions that broadcast with the model's.
-        sigma: (...) metres, positive.
-        outlier: (...) c, positive: the weight of "no partner" against a pair at distance zero.
-        mask: (..., M) False where a datum is padding, whose coordinates are never looked at.
-        model_outlier: b, positive: the same for model points.
-        sweeps: normalizations of rows and columns, at most; columns come last.
-        tolerance: largest relative change of a row's factor at which they end.
-
-    Returns:
-        an `EStep`, whose weights are at most one, up to the tolerance.
-
-    Differentiable: in ``model``, ``data``, ``sigma`` and ``outlier``, through the sweeps.
-
-    Cost: O(N M) memory, and time for each sweep.
-
-    References: Gold et al. 1998 and Rangarajan et al. 1997, as discussed by Dewaele et al. 2006, section 4.
+    ``m_ij = u_i exp(-|Y_j - X_i|^2 / 2 sigma^2) v_j`` is normalized in turn along rows and columns (Sinkhorn), each
+    with an entry for "no partner": ``sum_j m_ij + b u_i = 1`` (b is ``model_outlier``), ``sum_i m_ij + c v_j = 1`` (c
+    is ``outlier``); only b c matters. They bound u by 1 / b and v by 1 / c at any sigma. At most ``sweeps``, until a
+    row's factor changes by less than ``tolerance``. Gold et al. 1998, Rangarajan et al. 1997; Dewaele et al. 2006,
+    section 4.
     """
     sigma = torch.as_tensor(sigma, dtype=model.dtype, device=model.device)
     outlier = torch.as_tensor(outlier, dtype=model.dtype, device=model.device)

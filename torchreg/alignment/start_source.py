@@ -1,4 +1,4 @@
-"""Where starts come from: rough poses that a search goes on from, and those that a network proposes."""
+"""Sources of start poses: rough poses for a search, and the proposals of a network."""
 
 from __future__ import annotations
 
@@ -26,13 +26,7 @@ from torchreg.shapes.skin import LinearBlendSkin
 
 @dataclass(frozen=True)
 class StartSource:
-    """Where candidates come from.
-
-    Args:
-        sources: of rough poses, which are searched on from.
-        proposer: a network, whose poses need a fit alone, or None.
-        known: what is known beforehand, or None.
-    """
+    """Sources of rough poses to search from, a network whose poses need a fit alone, and known degrees of freedom."""
 
     sources: Sequence[PoseSource]
     proposer: PoseProposer | None = None
@@ -46,12 +40,7 @@ class StartSource:
         initializer: PoseProposer | HoldsProposer | None = None,
         upright: Direction | None = None,
     ) -> StartSource:
-        """Return what is given, or else the default for a shape: upright poses alone where it is known to stand.
-
-        Raises:
-            InputError: if the sources are an empty list, or the network is for another shape.
-            InputTypeError: if the network is none.
-        """
+        """Return the given sources, or else the default for a shape: upright poses alone where ``upright`` is given."""
         if sources is None and upright is not None:
             sources = (UprightRotations(upright),)
         if sources is not None and not sources:
@@ -61,28 +50,25 @@ class StartSource:
             proposer = check_proposer(shape, initializer)
         return cls(DEFAULT_SOURCES if sources is None else sources, proposer)
 
-    def informed(self, known: KnownDofs | None) -> StartSource:
-        """Return the same whose poses are what is known beforehand, as far as that goes."""
+    def with_known(self, known: KnownDofs | None) -> StartSource:
+        """Return the source with known degrees of freedom substituted in its poses."""
         return replace(self, known=known)
 
     def rough(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
         """Return rough poses (B, K, num_dofs) of all sources."""
-        return self._told(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
+        return self._substituted(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
 
     def proposed(self, problem: AlignProblem, count: int) -> tuple[AlignProblem, Tensor]:
-        """Return the problem with the network's pose as the prior, and its poses (B, count, num_dofs) after a fit.
-
-        Without a network there are none (B, 0, num_dofs), and the problem stays.
-        """
+        """Return the problem with the network's pose as the prior, and its fitted poses (B, count, num_dofs)."""
         if self.proposer is None:
             return problem, problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
         proposals = self.proposer.propose(problem.data, problem.valid)
         problem = with_proposed_prior(problem, proposals)
-        return problem, self._told(problem, best_proposals(problem, proposals, count))
+        return problem, self._substituted(problem, best_proposals(problem, proposals, count))
 
     @torch.no_grad()
-    def glance(self, skin: LinearBlendSkin, frame: DepthFrame) -> float:
-        """Return how well a frame is explained by the network's pose of the shape of a skin; 1 without a network."""
+    def crop_score(self, skin: LinearBlendSkin, frame: DepthFrame) -> float:
+        """Return the confidence in the network's pose of the shape in a frame; 1 without a network."""
         if self.proposer is None:
             return 1.0
         near = frame.near(frame.points.double().mean(0))
@@ -94,8 +80,10 @@ class StartSource:
         )  # fmt: skip
         with one_thread():
             best = best_proposal(problem, self.proposer.propose(data, valid))
-            judged = without_cut(problem, best.pose, [near])
-            return float(explains(judged, best.pose, best.lead))
+            uncropped = without_cut(problem, best.pose, [near])
+            return float(explains(uncropped, best.pose, best.lead))
 
-    def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
-        return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))
+    def _substituted(self, problem: AlignProblem, poses: Tensor) -> Tensor:
+        return problem.clamp_candidates(
+            poses if self.known is None else self.known.substitute_prior_means(problem, poses)
+        )

@@ -51,19 +51,10 @@ def fit_surface(
     widths: Sequence[float] = SURFACE_FIT.widths,
     on_step: OnStep | None = None,
 ) -> StageResult:
-    """Return the pose after fitting the surface to the data, eqs. 21 and 22, with a kernel that narrows to the noise.
+    """Return the pose (B, num_dofs) fitted to the data, eqs. 21 and 22, with a kernel that narrows to the noise.
 
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs) to start from.
-        steps: damped steps per width, at least one; the last width takes up to three times as many, tested.
-        widths: of the kernel before the last, as shares of the model's size.
-        on_step: called after each width.
-
-    Returns:
-        a `StageResult`.
-
-    References: Dewaele et al. 2006, section 3.4.
+    ``steps`` damped steps per width, shares of the model's size; the last takes up to three times as many, tested.
+    Dewaele et al. 2006, section 3.4.
     """
     noise = torch.full_like(pose[:, 0], SURFACE_FIT.max_noise(problem.size))
     num_steps = len(widths) + 1
@@ -84,14 +75,7 @@ def fit_surface(
 
 @dataclass(frozen=True)
 class SurfaceResult:
-    """Poses after steps on the surface.
-
-    Args:
-        pose: (B, num_dofs).
-        distance: (B, M) of the data from the surface in these poses.
-        jacobian: (B, M, num_dofs) of the distances.
-        change: (B,) of the last step.
-    """
+    """Poses (B, num_dofs) after steps on the surface, distances (B, M), their Jacobian, and the last change (B,)."""
 
     pose: Tensor
     distance: Tensor
@@ -148,17 +132,7 @@ def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 
 def surface_noise(distance: Tensor, valid: Tensor, size: float, *, clamped: bool = True) -> Tensor:
-    """Return the robust standard deviation (...) of distances (..., M) near the surface of a model of some size.
-
-    Args:
-        distance: (..., M), metres.
-        valid: (..., M) True where the distance counts.
-        size: of the model, metres; the answer lies within a range of it, at its upper end where nothing is near.
-        clamped: whether that range holds; without it all data within the first kernel count.
-
-    Returns:
-        (...), metres.
-    """
+    """Return the robust standard deviation (...) of distances (..., M) near the surface, ``clamped`` by the size."""
     distance = distance.abs()
     near = (distance < SURFACE_FIT.widths[-1 if clamped else 0] * size) & valid
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
@@ -169,19 +143,7 @@ def surface_noise(distance: Tensor, valid: Tensor, size: float, *, clamped: bool
 
 
 def pose_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
-    """Return the covariance of fitted poses, ``(J^T W J / noise^2 + diag(precision))^-1``.
-
-    Args:
-        jacobian: (..., M, D) of the residuals.
-        weights: (..., M) of the residuals, from 0 to 1.
-        noise: (...) standard deviation of the residuals.
-        precision: (..., D) or (D,) of the prior; positive wherever residuals do not tell.
-
-    Returns:
-        (..., D, D), in the coordinates of the Jacobian.
-
-    Differentiable: in all.
-    """
+    """Return the covariance (..., D, D) of fitted poses, ``(J^T W J / noise^2 + diag(precision))^-1``."""
     rows = (jacobian * (weights.sqrt() / noise.unsqueeze(-1)).unsqueeze(-1)).double()
     information = rows.mT @ rows + torch.diag_embed(precision.double())
     scale = information.diagonal(dim1=-2, dim2=-1).rsqrt()

@@ -239,16 +239,7 @@ def pose_errors(raw: RawPoses, batch: CloudBatch, compared: LinearBlendSkin, siz
 def proposal_loss(
     raw: RawPoses, batch: CloudBatch, skin: LinearBlendSkin, compared: LinearBlendSkin, size: float, width: float
 ) -> Tensor:
-    """Return the loss () of proposals, see `train_initializer`.
-
-    Args:
-        raw: of the network.
-        batch: the clouds and the truth.
-        skin: whose points the clouds show.
-        compared: points by which poses are compared.
-        size: of the shape, metres.
-        width: scale of the errors' distribution, as a share of the size.
-    """
+    """Return the loss () of proposals, see `train_initializer`; ``width`` scales the errors, as a share of the size."""
     errors = pose_errors(raw, batch, compared, size)
     likely = torch.logsumexp(raw.logits.log_softmax(-1) - errors / width, dim=-1)
     # In units of the error: the gradient does not grow as the distribution narrows.

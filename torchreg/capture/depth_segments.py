@@ -172,15 +172,7 @@ def _rim_distance(grid: _Grid, nodes: list[int]) -> Tensor:
 
 
 def beyond_cut(frame: DepthFrame, off: Tensor) -> Tensor:
-    """Return which points (M,) off a shape belong to what the mask, or the rim of the picture, cuts off.
-
-    Args:
-        frame: the picture.
-        off: (M,) bool, True for points off the shape.
-
-    Returns:
-        (M,) bool, True for points that are joined to the cut by points off the shape: of a forearm, say.
-    """
+    """Return which points (M,) off a shape belong to what the mask, or the rim of the picture, cuts off."""
     edges = frame.links
     edges = edges[off[edges].all(-1)]
     part = connected_components(edges, len(off))
@@ -192,9 +184,7 @@ def beyond_cut(frame: DepthFrame, off: Tensor) -> Tensor:
 def open_rim(frame: DepthFrame, lies_on: Callable[[Tensor], Tensor]) -> float:
     """Return the share of the rim of what lies on a shape along which the measured surface goes on, from 0 to 1.
 
-    Args:
-        frame: the picture; what its mask leaves out is looked at, too.
-        lies_on: which of points (M, 3), in world coordinates, lie on the shape, (M,) bool.
+    ``lies_on``: which of points (M, 3), in world coordinates, lie on the shape, (M,) bool.
     """
     stride, surface = frame.stride, frame.without_mask.measured
     depth = (frame.depth * surface)[::stride, ::stride]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,28 @@ def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
     rows = [tensor.detach().reshape(-1, tensor.shape[-1]) for tensor in tensors]
     middle, spread = _middle(rows[0] if len(rows) == 1 else torch.cat(rows))
     return middle.round() if middle is not None and float(middle.abs().max()) > _FAR.ratio * spread > 0 else None
+
+
+def to_local(value: Value, origin: Tensor | None) -> Value:
+    """Return points (..., 3), poses (..., D), a scan or an observation in coordinates that begin at an origin (3,).
+
+    Tensors become float64. Nothing changes without a value or an origin.
+    """
+    if value is None or origin is None:
+        return value
+    given: Any = value
+    if isinstance(given, Tensor):
+        given = given.double()
+        return cast(Value, torch.cat([given[..., :3] - origin.to(given.device), given[..., 3:]], dim=-1))
+    return given.near(origin) if hasattr(given, "near") else given.shifted(-origin)
+
+
+def to_world(value: Value, origin: Tensor | None) -> Value:
+    """Return poses, or a result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+    if origin is None:
+        return value
+    given: Any = value
+    return to_local(value, -origin) if isinstance(value, Tensor) else given.moved(origin)
 
 
 def _middle(points: Tensor) -> tuple[Tensor | None, float]:

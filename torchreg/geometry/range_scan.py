@@ -22,7 +22,7 @@ from torchreg._checks import (
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.boundary import BOUNDARY, boundary_of_faces, boundary_of_points
 from torchreg.geometry.depth_image import unproject
-from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.far_origin import far_origin, to_local
 from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import distinct_positions, k_nearest_others, nearest_neighbor, sampling_distance
 from torchreg.geometry.normals import (
@@ -107,8 +107,7 @@ class RangeScan:
         camera = None if viewpoint is None else _as_viewpoint(viewpoint)
         with torch.no_grad():
             origin = far_origin(points)  # products of large coordinates lose digits
-            near = points if origin is None else points - origin.to(points)
-            seen_from = camera if camera is None or origin is None else camera - origin.to(camera)
+            near, seen_from = to_local(points, origin), to_local(camera, origin)
             normals, boundary, spacing = _measure(near, faces, normals, seen_from)
         self._set(
             points=points,

@@ -24,22 +24,10 @@ _CROWDING = _Crowding()
 def draw_spread(points: Tensor, count: int, size: float, generator: torch.Generator) -> Tensor:
     """Return indices of points drawn at random, of which those in crowded places are drawn more rarely.
 
-    As long as points lie in some hundreds of places this is a plain draw, and thin outliers stay as rare as they are.
-    Where a few places hold most of the points, as of copies or of a sensor close by, they are drawn as if these held
-    only so many that hundreds of places count.
-
-    Args:
-        points: (M, 3) finite.
-        count: of points drawn, at most M.
-        size: of what was measured, in the points' unit, positive.
-        generator: of the draw.
-
-    Returns:
-        Indices (count,) int64, all different, ascending.
-
-    Cost: O(M log M); 1 s for five million points.
-
-    References: Efraimidis and Spirakis 2006, weighted sampling without replacement.
+    Indices (count,) are all different and ascending. As long as the points (M, 3) lie in some hundreds of places this
+    is a plain draw. Where a few places hold most of the points, as of copies or of a sensor close by, they are drawn as
+    if these held only so many that hundreds of places count; ``size`` is that of what was measured (Efraimidis and
+    Spirakis 2006, weighted sampling without replacement).
     """
     place, held = _places(points, size / _CROWDING.cells)
     weight = (_crowded_from(held) / held).clamp_max(1).float()[place]

@@ -22,7 +22,7 @@ from torchreg._checks import (
 )
 from torchreg._threads import one_thread
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
-from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.far_origin import far_origin, to_local, to_world
 from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
@@ -125,19 +125,15 @@ def register(
             rows if rows is None or kept is None else rows[kept.to(rows.device)] for rows in (start, confidence, parts)
         )
     origin = far_origin((source.points, target.points))
-    if origin is not None:
-        return register(
-            source.shifted(-origin), target.shifted(-origin), num_bones, grid_resolution, config, generator, on_step,
-            start=None if start is None else start - origin, confidence=confidence, parts=parts,
-            support="keep",
-        ).moved(origin)  # fmt: skip
+    source, target, start = to_local(source, origin), to_local(target, origin), to_local(start, origin)
     degenerate = warn_about_flat_scans((source, target), stacklevel=4)
     if start is None:
         warn_about_units((source, target), ("source", "target"), stacklevel=4)
-    return _registered(
+    found = _registered(
         source, target, num_bones, grid_resolution, config, generator, on_step,
         start=start, confidence=confidence, parts=parts, degenerate=degenerate,
     )  # fmt: skip
+    return to_world(found, origin)
 
 
 def _registered(

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchreg._checks import check_count, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
-from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.far_origin import far_origin, to_local, to_world
 from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
@@ -191,11 +191,7 @@ def register_sequence(
     if reference >= len(scans):
         raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
     origin = far_origin([scan.points for scan in scans])
-    if origin is not None:
-        near = [scan.shifted(-origin) for scan in scans]
-        return register_sequence(
-            near, num_bones, grid_resolution, config, generator, on_step, reference=reference
-        ).moved(origin)  # fmt: skip
+    scans = tuple(to_local(scan, origin) for scan in scans)
     degenerate = warn_about_flat_scans(scans, stacklevel=4)
     warn_about_units(scans, [f"scans[{number}]" for number in range(len(scans))], stacklevel=4)
     source = scans[reference]
@@ -214,7 +210,7 @@ def register_sequence(
     converged = fit.refine() and converged
     found = _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
     doubtful = bool((sure < SCAN_CALIBRATION.doubtful).any()) and found.status.usable
-    return replace(found, confidence=sure, status=Status.DOUBTFUL if doubtful else found.status)
+    return to_world(replace(found, confidence=sure, status=Status.DOUBTFUL if doubtful else found.status), origin)
 
 
 def _aligned_frames(

@@ -19,9 +19,7 @@ from torchreg.shapes.skin import LinearBlendSkin, stacked_rows
 class _DenseSkin:
     """Numbers of dense skins and of distances to their tangent planes."""
 
-    # Vertices of a mesh that is dense enough, and not too large, to be a skin itself; other meshes are sampled.
-    min_vertices: int = 800
-    max_vertices: int = 6000
+    # Of a file's mesh, evenly: vertices lie where the mesh bends, and far apart on its large faces.
     num_samples: int = 4000
     # Points that tell the spacing of a skin.
     num_spacings: int = 500
@@ -122,7 +120,7 @@ def _first_copies(skin: LinearBlendSkin) -> Tensor:
 
 
 def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
-    """Return a dense skin with normals of the file's mesh: its vertices, or samples if they are too many or too few.
+    """Return a dense skin of samples, with normals, of the file's mesh.
 
     Raises:
         InputError: if the shape was not read from a file with a mesh.
@@ -131,13 +129,9 @@ def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
     if surface is None:
         raise InputError("this shape has no file surface: it was not read from a file with a mesh")
     mesh = TriangleMesh(surface.vertices, surface.faces)
-    used = mesh.faces.unique()
-    if _DENSE.min_vertices <= len(used) <= _DENSE.max_vertices:
-        points, normals, weights = mesh.vertices[used], mesh.vertex_normals()[used], surface.weights[used]
-    else:
-        points, face, barycentric = sample_surface(mesh, _DENSE.num_samples)
-        normals = mesh.face_normals()[face]
-        weights = interpolate(surface.weights.to(barycentric), mesh.faces, face, barycentric)
+    points, face, barycentric = sample_surface(mesh, _DENSE.num_samples)
+    normals = mesh.face_normals()[face]
+    weights = interpolate(surface.weights.to(barycentric), mesh.faces, face, barycentric)
     # The file's vertices lie in the pose of all zeros, whether or not the joint limits allow it.
     reference = torch.zeros_like(shape.rest)
     return LinearBlendSkin(

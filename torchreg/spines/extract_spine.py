@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg._checks import check_count, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
-from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.far_origin import far_origin, to_world
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
@@ -186,7 +186,7 @@ def extract_spine(
         spine = _joined_spine(surfaces, shown, known, times, config, workers=workers, progress=progress)
     if passed:
         spine = with_frames_between(spine, kept, when, {number: found[number][0] for number in passed})
-    return spine if origin is None else spine.moved(origin)
+    return to_world(spine, origin)
 
 
 @torch.no_grad()

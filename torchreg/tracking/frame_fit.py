@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import anneal
-from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, share_beside
+from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, near_outlier_share
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.curvature import hardly_gains
 from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
@@ -51,7 +51,13 @@ _SETTINGS = FrameSettings()
 
 
 class FrameFitter:
-    """Fits a shape to frames, from predictions or from given poses; model points are sampled by default."""
+    """Fits a shape to frames, from predictions or from given poses.
+
+    Args:
+        shape: the articulated shape, in metres.
+        config: see `TrackConfig`.
+        skin: the model points; sampled by default.
+    """
 
     def __init__(self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None) -> None:
         self.shape, self.config = shape, config
@@ -102,7 +108,7 @@ class FrameFitter:
             landmarks=None if frame.keypoints is None else frame.keypoints.of_problems(self._keypoints, origin[None]),
         )  # fmt: skip
         if frame.known is not None:
-            informed = frame.known.near(origin).applied(problem, local[None])
+            informed = frame.known.near(origin).with_prior(problem, local[None])
             prior = replace(informed.prior, precision=informed.prior.precision[0])
             problem = replace(informed, lower=informed.lower[0], upper=informed.upper[0], prior=prior)
         return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
@@ -176,7 +182,7 @@ class FrameFitter:
         problem, pose = fit.view.problem, fit.pose
         moves = end_motions(self.skin, pose, self._ends)
         evidence = weigh(
-            problem, fit.distance, beside=share_beside(problem, fit.distance),
+            problem, fit.distance, beside=near_outlier_share(problem, fit.distance),
             clustered=pose.new_tensor([len(fit.unexplained) / max(1, fit.num_inliers)]),
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
             intruding=fit.intruding,
@@ -216,8 +222,8 @@ class FrameFitter:
         shift, turn, joints = prediction_std(state, elapsed, self.size, self.config.prior_std).tolist()
         precision = self._joint_precision(joints)
         precision[:3], precision[3:6] = shift**-2, turn**-2
-        if problem.told_precision is not None:
-            precision = torch.where(problem.told_precision[0] > 0, prior.precision, precision)
+        if problem.prior_precision is not None:
+            precision = torch.where(problem.prior_precision[0] > 0, prior.precision, precision)
         return GaussianPosePrior(prior.mean, precision, holds_base=True)
 
     def _sigma_schedule(self, state: TrackState, elapsed: float) -> SigmaSchedule:

@@ -23,10 +23,10 @@ from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.far_origin import to_local, to_world
 from torchreg.geometry.loaded import as_points
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.config import TrackConfig
 from torchreg.tracking.evidence import deviates_far, is_doubtful, is_supported, is_unreliable, update_means
@@ -183,9 +183,7 @@ class Tracker:
         measured = self._checked_keypoints(keypoints, keypoint_std, picture)
         self._place_origin(given)
         cloud = self._checked_points(given)
-        if self._state.origin is not None:
-            picture = None if picture is None else picture.near(self._state.origin)
-            measured = None if measured is None else measured.near(self._state.origin)
+        picture, measured = to_local(picture, self._state.origin), to_local(measured, self._state.origin)
         known = self._known(prior)
         state, elapsed = advance_clock(self._state, time)
         finite = torch.isfinite(cloud).all(-1)
@@ -216,7 +214,7 @@ class Tracker:
                 result, coefficients=state.coefficients, coefficient_covariance=state.coefficient_covariance
             ))  # fmt: skip
         self._follow_closer()
-        return found if state.origin is None else found.moved(state.origin)
+        return to_world(found, state.origin)
 
     def run(
         self,
@@ -271,7 +269,7 @@ class Tracker:
     def _met(self, person: PersonFilter, state: TrackState, frame: Frame) -> TrackState:
         """Return the state with the person whom a frame shows, who is followed from now on; itself without one."""
         start = state.pose if state.found else None
-        met = person.met(frame.data if frame.picture is None else frame.picture, start)
+        met = person.initialize(frame.data if frame.picture is None else frame.picture, start)
         if met is None:
             return state
         pose, known = met
@@ -320,7 +318,7 @@ class Tracker:
             return
         origin = floating_origin(self.shape, points)
         if origin is not None:
-            start = shifted(self._start.double(), -origin).to(self.shape.rest)
+            start = to_local(self._start, origin).to(self.shape.rest)
             self._state = replace(self._state, origin=origin, pose=start)
 
     def _checked_points(self, points: Tensor) -> Tensor:
@@ -338,9 +336,7 @@ class Tracker:
         if known is None:
             return None
         held = torch.where(self._start.isfinite(), self._start, self.shape.rest.to(self._start))
-        origin = self._state.origin
-        near = known if origin is None else known.near(origin)
-        return near.holding(held if origin is None else shifted(held.double(), -origin))
+        return to_local(known, self._state.origin).holding(to_local(held, self._state.origin))
 
     def _checked_keypoints(self, keypoints: Any, std: Any, picture: DepthFrame | None) -> MeasuredKeypoints | None:
         """Return measured keypoints; None where none was seen."""
@@ -453,5 +449,5 @@ def _learned(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFi
         return state
     known = KnownPerson(state.coefficients, state.coefficient_covariance)
     viewpoint = None if frame.picture is None else frame.picture.camera.position - fit.view.origin
-    known = person.learned(known, fit.view.problem.data[0], fit.pose[0], viewpoint)
+    known = person.update(known, fit.view.problem.data[0], fit.pose[0], viewpoint)
     return replace(state, coefficients=known.coefficients, coefficient_covariance=known.covariance)

@@ -43,10 +43,7 @@ def bone_palette(count: int) -> Tensor:
 
 
 def weight_colors(weights: Tensor) -> Tensor:
-    """Return colors (..., N, 3) of weights (..., N, B): those of the bones, mixed by the weights.
-
-    Differentiable: in ``weights``.
-    """
+    """Return colors (..., N, 3) of weights (..., N, B): those of the bones, mixed by the weights."""
     total = weights.sum(-1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
     return (weights / total) @ bone_palette(weights.shape[-1]).to(weights)
 

@@ -60,7 +60,7 @@ def watch(
     Args:
         points: (N, 3), metres.
         camera: (3,) position; by default that of `Scene.camera`.
-        up: (3,) upright direction; by default as `geometry.upright.guess_up` tells it, or -y when a camera is given.
+        up: (3,) upright direction; by default that of `geometry.upright.guess_up`, or -y when a camera is given.
         size: width and height of the picture, pixels.
         margin: on each side, as a share of the picture.
 

@@ -13,19 +13,10 @@ from torchreg.registration.bones.joints import BoneTree
 
 @torch.no_grad()
 def between_poses(model: GridLBS, poses: Tensor, times: Tensor, *, tree: BoneTree | None = None) -> Tensor:
-    """Return poses of bones between key poses.
+    """Return poses (T, B, 4, 4) at times from 0 to K - 1 between key poses (K, B, 4, 4), as glTF viewers play them.
 
-    Relative to its parent in the tree of joints, each bone turns at constant speed about its joint, which itself moves
-    straight: limbs swing, they do not shrink. `save_grid_animation` writes the same motion into glTF files.
-
-    Args:
-        model: with the bones.
-        poses: (K, B, 4, 4) rigid key poses.
-        times: (T,) from 0, the first key pose, to K - 1, the last.
-        tree: of the bones; `GridLBS.skeleton` of the key poses by default.
-
-    Returns:
-        Poses (T, B, 4, 4); key poses are met up to rounding.
+    Relative to its parent in the tree, each bone turns at constant speed about its joint, which itself moves straight:
+    limbs swing, they do not shrink.
     """
     poses = poses.to(model.weights)
     tree = model.skeleton(poses) if tree is None else tree

@@ -16,14 +16,9 @@ Value = TypeVar("Value")
 
 
 class LatestWorker(Generic[Key, Value]):
-    """A thread that calls ``work`` with the newest value of every key that has changed since the last call.
+    """A thread that calls ``work`` with {key: newest value} of the keys that changed since the last call.
 
-    Submitting never waits: a mouse that moves faster than poses are solved makes no queue.
-
-    Args:
-        work: called with {key: newest value}.
-        on_error: called with errors that ``work`` raises; the thread goes on.
-        name: of the thread.
+    Submitting never waits. Errors of ``work`` go to ``on_error``; the thread goes on.
     """
 
     def __init__(

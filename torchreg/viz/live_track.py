@@ -21,13 +21,7 @@ if TYPE_CHECKING:
 
 
 class LiveTrack(Page):
-    """A page that shows the last frame of a tracker; usable in a ``with`` statement, at whose end the server stops.
-
-    Args:
-        skin: the surface to draw, with faces.
-        port: to listen on at 127.0.0.1, or a later one if it is taken.
-        up: the upright direction, see `Scene`.
-    """
+    """A page that shows the last frame of a tracker; usable in a ``with`` statement, at whose end the server stops."""
 
     def __init__(self, skin: LinearBlendSkin, *, port: int = 8080, up: Direction | None = None) -> None:
         self._skin, self._faces, self._up = skin, faces_of(skin).cpu(), up
@@ -37,10 +31,7 @@ class LiveTrack(Page):
         self._cloud: viser.PointCloudHandle | None = None
 
     def show(self, points: Tensor, frame: FrameResult) -> None:
-        """Show a frame: the data (M, 3) and the tracker's result for them.
-
-        The camera is placed by the first frame that is not empty.
-        """
+        """Show the data (M, 3) of a frame and the tracker's result; the first frame with data places the camera."""
         known = points.isfinite().all(-1).cpu()
         data = points.detach().cpu()[known]
         paint = inlier_paint(frame.inliers.cpu()[known], torch.ones(len(data)))

@@ -35,12 +35,7 @@ class PageGuard:
         return f"http://{host}:{port}/?{_PARAMETER}={self.token}"
 
     def defect(self, request: Any, port: int) -> str | None:
-        """Return what is wrong with a request to a port, None if it may pass.
-
-        Args:
-            request: with a ``path`` and ``headers``, as those of websockets.
-            port: that the server listens on.
-        """
+        """Return the fault of a request (with ``path`` and ``headers``) to a port, None if it may pass."""
         own = {f"{name}:{port}" for name in _NAMES}
         if request.headers.get_all("Host") not in [[host] for host in own]:
             return "Host"
@@ -88,7 +83,7 @@ class PageGuard:
 
     @contextmanager
     def around_start(self) -> Iterator[None]:
-        """Guard the server that is started in a ``with`` block; ``engaged`` tells whether one was."""
+        """Guard the server that is started in a ``with`` block; ``engaged`` says whether one was."""
         from websockets.asyncio import server
 
         plain = server.serve

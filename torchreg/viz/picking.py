@@ -11,18 +11,7 @@ _GRAZING = 1e-12
 
 @torch.no_grad()
 def meet_triangles(vertices: Tensor, faces: Tensor, origin: Tensor, direction: Tensor) -> tuple[int, Tensor] | None:
-    """Return the triangle that a ray meets first, from either side, and the position in it; None if it meets none.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3) int64.
-        origin: (3,) of the ray.
-        direction: (3,) of any length but zero.
-
-    Returns:
-        Number of the triangle, and barycentric coordinates (3,) of the point in it.
-
-    Cost: linear in F, 1 ms for 10,000 triangles.
+    """Return the first triangle that a ray meets from either side, with barycentric coordinates (3,); None if none.
 
     References: Moeller and Trumbore 1997.
     """
@@ -54,13 +43,6 @@ def pick_vertex(
 
     On a surface, the nearest corner of the triangle that the ray meets. Of points, the first along the ray among those
     whose distance from it is at most ``reach`` times their distance from the origin.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3) int64, or None for points.
-        origin: (3,) of the ray.
-        direction: (3,) of any length but zero.
-        reach: tangent of the largest angle between the ray and a point.
     """
     if faces is not None and len(faces):
         found = meet_triangles(vertices, faces, origin, direction)

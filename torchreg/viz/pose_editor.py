@@ -62,7 +62,7 @@ class PoseEditor:
         frame: of a `SequenceRegistration`, whose pose is the first one.
         start: (B, 4, 4) the first pose instead, such as ``transforms`` of a `PoseSolution`.
         config: of the solver.
-        up: the upright direction; by default that of the registration, or as its points tell it.
+        up: the upright direction; by default that of the registration, or guessed from its points.
 
     Raises:
         InputError: if there is no such frame or ``start`` does not fit.
@@ -133,11 +133,7 @@ class PoseEditor:
         return self.model.move(self.points[index], self._weights[index], self._state.transforms)
 
     def add_handle(self, vertex: int) -> int:
-        """Make a point of the scan a handle, unless it is one, and return its number.
-
-        Raises:
-            InputError: if there is no such point.
-        """
+        """Make a point of the scan a handle, unless it is one, and return its number."""
         if not 0 <= vertex < len(self.points):
             raise InputError(f"vertex must be from 0 to {len(self.points) - 1}, got {vertex}")
         with self._lock:
@@ -150,11 +146,7 @@ class PoseEditor:
             return len(vertices) - 1
 
     def remove_handle(self, number: int) -> None:
-        """Remove a handle; those after it get lower numbers.
-
-        Raises:
-            InputError: if there is none.
-        """
+        """Remove a handle; those after it get lower numbers."""
         with self._lock:
             self._check(number)
             state, keep = self._state, [k for k in range(len(self._state.vertices)) if k != number]
@@ -162,11 +154,7 @@ class PoseEditor:
             self._enter(replace(state, vertices=vertices, targets=state.targets[keep], pinned=pinned))
 
     def pin(self, number: int, pinned: bool = True) -> None:
-        """Fix a handle at its position while others are dragged, or release it.
-
-        Raises:
-            InputError: if there is none.
-        """
+        """Fix a handle at its position while others are dragged, or release it."""
         with self._lock:
             self._check(number)
             state = self._state
@@ -246,11 +234,7 @@ class PoseEditor:
         return len(self._keys)
 
     def animation(self, frames_per_key: int = _PLAYBACK.played) -> Tensor:
-        """Return poses (T, B, 4, 4) through the key poses, as a glTF viewer plays the file of `save_gltf`.
-
-        Raises:
-            InputError: if there are fewer than two key poses.
-        """
+        """Return poses (T, B, 4, 4) through at least two key poses, as a glTF viewer plays the file of `save_gltf`."""
         if len(self._keys) < 2:
             raise InputError(f"an animation needs two key poses at least, got {len(self._keys)}")
         steps = frames_per_key * (len(self._keys) - 1)
@@ -258,11 +242,7 @@ class PoseEditor:
         return between_poses(self.model, torch.stack(self._keys), times)
 
     def save_pose(self, path: str | Path) -> Path:
-        """Return the path of the current `PoseSolution` (.safetensors and .json).
-
-        Raises:
-            InputError: before the first drag, or if the ending is another.
-        """
+        """Return the path of the current `PoseSolution` (.safetensors and .json); InputError before the first drag."""
         solution = self._state.solution
         if solution is None:
             raise InputError("nothing was posed yet; drag a handle first")

@@ -177,7 +177,7 @@ def frame_labels(result: TrackResult) -> list[str]:
 
 
 def near_surface(shape: ArticulatedShape, poses: Tensor, reach: float | None = None) -> Inliers:
-    """Return what tells which data of a frame are near the shape in its pose (T, num_dofs); none without a pose.
+    """Return the function that marks the data of a frame near the shape in its pose (T, num_dofs); none without a pose.
 
     Args:
         shape: the articulated shape.

@@ -40,16 +40,10 @@ _SHADING = _Shading()
 
 
 def render_mesh(mesh: TriangleMesh, view: View, paint: Tensor | Color | Paint = SKIN_COLOR) -> Tensor:
-    """Return a shaded picture of a surface, with smooth normals, two lights and dark crevices.
+    """Return a shaded picture (view.height / 2, view.width / 2, 4) of a surface: red, green, blue, opacity in [0, 1].
 
-    Args:
-        mesh: a surface; triangles that face away are shaded from behind.
-        view: camera and rendered pixels, 2 x 2 for each pixel of the picture, see `watch`.
-        paint: (V, 3) colors in [0, 1], one color, or what gives the colors (N, 3) of N places, by face and barycentric
-            coordinates (N, 3).
-
-    Returns:
-        Red, green, blue and opacity (view.height / 2, view.width / 2, 4) in [0, 1].
+    Colors are given per vertex (V, 3), as one, or by a function of faces (N,) and barycentric coordinates (N, 3).
+    Triangles that face away are shaded from behind; `watch` gives the view of 2 x 2 pixels for each of the picture.
     """
     raster = rasterize(mesh, view)
     seen = raster.face_index >= 0
@@ -103,10 +97,7 @@ def _light(normals: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _crevices(depth: Tensor, seen: Tensor) -> Tensor:
-    """Return the darkening (H, W) of pixels that lie behind their surroundings, 0 to 0.5.
-
-    References: Luft, Colditz and Deussen 2006, unsharp masking of the depth buffer.
-    """
+    """Return the darkening (H, W) of pixels behind their surroundings, 0 to 0.5 (Luft, Colditz and Deussen 2006)."""
     if not bool(seen.any()):
         return torch.zeros(depth.shape, device=depth.device)
     known = depth[seen]

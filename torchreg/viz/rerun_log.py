@@ -1,4 +1,4 @@
-"""Scenes as recordings of the viewer rerun, which plays them beside other sensors."""
+"""Scenes as recordings of the viewer rerun, which plays them next to other sensors."""
 
 from __future__ import annotations
 

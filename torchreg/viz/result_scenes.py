@@ -89,9 +89,8 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
     masks, posterior = _batched(result.inliers, 1), _batched(result.posterior, 1)
     clouds = _clouds(data, len(poses))
     layers = shape_layers(shape, poses)
-    layers.append(
-        _points("registered points", _batched(result.registered, 2), DATA_COLORS.inlier, visible=shape is None)
-    )
+    registered = list(_batched(result.registered, 2))
+    layers.append(_cloud("registered points", registered, DATA_COLORS.inlier, visible=shape is None))
     layers.append(_keypoints(_batched(result.keypoints, 2), visible=shape is None))
     for frame, cloud in enumerate(clouds):
         check_shape(masks[frame], "result.inliers", (len(cloud),))
@@ -171,7 +170,8 @@ def _calibration_scene(result: Calibration, shape: ArticulatedShape | None, data
     clouds = _clouds(data, len(result.poses))
     layers = shape_layers(result.shape, result.poses)
     if shape is not None:
-        layers += [_renamed(layer, f"given {layer.name}") for layer in shape_layers(shape, result.poses)]
+        given = shape_layers(shape, result.poses)
+        layers += [replace(layer, name=f"given {layer.name}", visible=False) for layer in given]
     if clouds:
         layers.append(_cloud("data", clouds, DATA_COLORS.inlier))
     return Scene("calibrated shape", tuple(layers))
@@ -195,8 +195,7 @@ def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Sc
         _bones(result.model, poses),
     ]
     for target in data[:1]:
-        points, over = (target.vertices, target.faces) if isinstance(target, TriangleMesh) else (target, None)
-        layers.append(_scan("target", points, over, _STYLE.target, opacity=0.5))
+        layers.append(_scan("target", _vertices(target), getattr(target, "faces", None), _STYLE.target, opacity=0.5))
     title = f"{counted(result.model.num_bones, 'bone')}, {float(result.matched.float().mean()):.0%} of the points match"
     facts = {"status": result.status.value, "distance, median": f"{float(errors.median()):.3g}"}
     if result.confidence is not None:
@@ -289,7 +288,7 @@ def _surface_frames(data: Data, opacity: float = 0.3) -> list[Layer]:
     meshes = [item for item in data if isinstance(item, TriangleMesh)]
     if meshes and len(meshes) == len(data):
         return [Meshes("surface", meshes, _STYLE.body, opacity=opacity)]
-    clouds = [(item.vertices if isinstance(item, TriangleMesh) else item).detach() for item in data]
+    clouds = [_vertices(item).detach() for item in data]
     return [Cloud("surface", clouds, _STYLE.body, size=0.003)] if clouds else []
 
 
@@ -305,7 +304,7 @@ def _scan(
     name: str,
     points: Tensor,
     faces: Tensor | None,
-    paint: Tensor | tuple[float, float, float],
+    paint: Tensor | Color,
     *,
     visible: bool = True,
     opacity: float = 1.0,
@@ -319,38 +318,30 @@ def _scan(
 
 
 def _cloud(
-    name: str, frames: Sequence[Tensor], paints: Sequence[Tensor] | tuple[float, float, float], *, visible: bool = True
+    name: str, frames: Sequence[Tensor], paints: Sequence[Tensor] | Color, *, size: float = 0.006, visible: bool = True
 ) -> Cloud:
     """Return a layer of clouds without the points that are not finite."""
     keep = [points.isfinite().all(-1) for points in frames]
     if not isinstance(paints, tuple):
         paints = [paint[mask] for paint, mask in zip(paints, keep, strict=True)]
-    return Cloud(
-        name, [points.detach()[mask] for points, mask in zip(frames, keep, strict=True)], paints, visible=visible
-    )
-
-
-def _points(
-    name: str, points: Tensor, color: tuple[float, float, float], size: float = 0.006, *, visible: bool
-) -> Cloud:
-    frames = [frame[frame.isfinite().all(-1)] for frame in points.detach()]
-    return Cloud(name, frames, color, size=size, visible=visible)
+    shown = [points.detach()[mask] for points, mask in zip(frames, keep, strict=True)]
+    return Cloud(name, shown, paints, size=size, visible=visible)
 
 
 def _keypoints(points: Tensor, *, visible: bool) -> Cloud:
-    return _points("keypoints", points, _STYLE.keypoint, 0.02, visible=visible)
+    return _cloud("keypoints", list(points), _STYLE.keypoint, size=0.02, visible=visible)
 
 
 def _clouds(data: Data, count: int) -> list[Tensor]:
     if data and len(data) != count:
         raise InputError(f"data must hold one cloud per frame ({count}), got {len(data)}")
-    return [(item.vertices if isinstance(item, TriangleMesh) else item).detach().cpu() for item in data]
+    return [_vertices(item).detach().cpu() for item in data]
+
+
+def _vertices(item: Tensor | TriangleMesh) -> Tensor:
+    return item.vertices if isinstance(item, TriangleMesh) else item
 
 
 def _batched(value: Tensor, dimensions: int) -> Tensor:
     """Return a tensor on the CPU with a leading dimension of frames, added if it lacks one."""
     return value.detach().cpu().unsqueeze(0) if value.ndim == dimensions else value.detach().cpu()
-
-
-def _renamed(layer: Layer, name: str) -> Layer:
-    return replace(layer, name=name, visible=False)

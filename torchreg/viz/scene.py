@@ -283,8 +283,8 @@ class Scene:
         title: of the page.
         layers: with different names; moving ones have T frames each.
         times: (T,) seconds, strictly increasing; one frame every 1 / 20 second by default.
-        up: upright direction; by default as `geometry.upright.guess_up` tells it.
-        facts: key figures in words, by name, shown beside the scene.
+        up: upright direction; by default that of `geometry.upright.guess_up`.
+        facts: key figures in words, by name, shown next to the scene.
         captions: of the frames, in pictures; none by default.
 
     Raises:
@@ -347,7 +347,7 @@ class Scene:
         return middle - 0.5 * size / math.sin(FIELD_OF_VIEW / 2) * direction, middle, up
 
     def _guessed_up(self) -> Direction:
-        """Return the likely upright direction, told from what moves, or else from all that is seen."""
+        """Return the likely upright direction, guessed from the layers that move, or else from all visible ones."""
         layers = self._shown
         count = max(layer.num_frames for layer in layers)
         moving = [layer for layer in layers if layer.num_frames == count]

@@ -52,12 +52,7 @@ def picture_with_points(
 ) -> Tensor:
     """Return a faded picture (H, W, 3) with points, inliers blue and others red, and an outline in green.
 
-    Args:
-        image: (H, W) or (H, W, 3) from 0 to 1.
-        pixels: (N, 2) as (column, row); those beside the picture and NaN are omitted.
-        inliers: (N,) bool.
-        outline: (H, W) bool, see `model_outline`.
-        radius: of a point, pixels.
+    Pixels (N, 2) are (column, row); those outside the picture and NaN are omitted. The radius of a point is in pixels.
     """
     drawn = image.unsqueeze(-1).expand(*image.shape, 3) if image.ndim == 2 else image
     drawn = 1 - _OVERLAY.contrast * (1 - drawn.float())
@@ -79,7 +74,7 @@ def picture_with_points(
 
 
 def model_mask(mesh: TriangleMesh, camera: Camera) -> Tensor:
-    """Return the mask (H, W) of a mesh in a camera's picture; empty if a part of it lies beside or behind the camera.
+    """Return the mask (H, W) of a mesh in a camera's picture; empty if a part of it is not in front of the camera.
 
     Parts that only the distortion of the lens brings into the picture are missing.
     """
@@ -104,12 +99,7 @@ def mask_outline(mask: Tensor) -> Tensor:
 
 
 def cut_picture(depth: Tensor, kept: Tensor) -> Tensor:
-    """Return a depth image in color (H, W, 3): by depth where kept, red where filtered, black where not measured.
-
-    Args:
-        depth: (H, W) metres, zero where nothing was measured.
-        kept: (H, W) bool.
-    """
+    """Return a depth image in color (H, W, 3): by depth where kept, red where filtered, black where it is zero."""
     known = depth > 0
     seen = torch.where(kept & known, -depth, torch.nan)
     values = seen[kept & known]
@@ -119,12 +109,7 @@ def cut_picture(depth: Tensor, kept: Tensor) -> Tensor:
 
 
 def hull_picture(mask: Tensor, hull: Tensor) -> Tensor:
-    """Return a picture (H, W, 3) of a mask and its hull: white in both, red in the mask alone, blue in the hull alone.
-
-    Args:
-        mask: (H, W) bool.
-        hull: (H, W) bool, see `model_mask`.
-    """
+    """Return a picture (H, W, 3) of a mask and its hull: white in both, red in the mask, blue in the hull alone."""
     colors, style = torch.zeros(*mask.shape, 3), _OVERLAY
     for region, color in ((mask & hull, style.covered), (mask & ~hull, style.outlier), (hull & ~mask, style.inlier)):
         colors[region] = colors.new_tensor(color)
@@ -132,14 +117,7 @@ def hull_picture(mask: Tensor, hull: Tensor) -> Tensor:
 
 
 def hull_sheet(masks: Sequence[Tensor], cameras: CameraRig, mesh: TriangleMesh, width: int = 240) -> Tensor:
-    """Return the `hull_picture` of every camera side by side in rows (H, W, 3).
-
-    Args:
-        masks: one (H, W) bool per camera.
-        cameras: calibrated.
-        mesh: the surface of the hull.
-        width: approximate width of each picture, pixels.
-    """
+    """Return the `hull_picture` of every camera side by side in rows (H, W, 3), each about ``width`` pixels wide."""
     pictures = []
     for mask, camera in zip(masks, cameras, strict=True):
         step = max(1, camera.width // width)
@@ -161,11 +139,6 @@ class StereoPictures:
     """Writes two pictures of every tracked frame: disparity_0000.png, and frame_0000.png with the points.
 
     In the second, inliers are blue, and the outline of the shape in its pose is green.
-
-    Args:
-        frames: of the tracker.
-        skin: the surface of the shape, with faces.
-        folder: of the pictures.
     """
 
     def __init__(self, frames: StereoFrames, skin: LinearBlendSkin, folder: Path) -> None:

@@ -117,13 +117,7 @@ def _plain(text: str) -> str:
 
 
 class Timeline:
-    """Controls for the frame: a slider, play and pause, speed.
-
-    Args:
-        server: of the page.
-        seconds: (T,) times of the frames.
-        show: called with the number of a frame, by one thread at a time.
-    """
+    """Controls for the frame: slider, play and pause, speed; one thread at a time calls ``show`` with its number."""
 
     def __init__(self, server: viser.ViserServer, seconds: list[float], show: Callable[[int], None]) -> None:
         self._seconds, self._show = seconds, show

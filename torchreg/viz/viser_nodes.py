@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 class DrawnScene:
-    """A scene drawn on a server, one frame at a time.
-
-    Args:
-        api: ``scene`` of a server.
-        scene: to draw.
-    """
+    """A scene drawn on a server (by its ``scene``), one frame at a time."""
 
     def __init__(self, api: viser.SceneApi, scene: Scene) -> None:
         self._api, self._scene = api, scene
@@ -49,13 +44,7 @@ class DrawnScene:
 
 
 class _DrawnLayer:
-    """Nodes of one layer.
-
-    Args:
-        nodes: their handles.
-        update: moves them to a frame and returns the visible ones.
-        num_frames: of the layer.
-    """
+    """Nodes of one layer; ``update`` moves them to a frame and returns the visible ones."""
 
     def __init__(self, nodes: list[Any], update: Callable[[int], list[Any]], num_frames: int) -> None:
         self._nodes, self._update, self._num_frames = nodes, update, num_frames

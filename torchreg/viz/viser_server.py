@@ -23,12 +23,7 @@ HOST = "127.0.0.1"
 
 
 class Page:
-    """A page on a server; usable in a ``with`` statement, at whose end the server stops.
-
-    Args:
-        title: above the controls.
-        port: to listen on at 127.0.0.1, or a later one if it is taken.
-    """
+    """A page on a server; usable in a ``with`` statement, at whose end the server stops."""
 
     def __init__(self, title: str, port: int) -> None:
         self.server = start_server(title, port)
@@ -63,12 +58,7 @@ def import_viser() -> Any:
 
 
 def start_server(title: str, port: int) -> viser.ViserServer:
-    """Return a server on 127.0.0.1, which other machines cannot reach, which contacts none, and lets in `page_url`.
-
-    Args:
-        title: above the controls.
-        port: to listen on, or a later one if it is taken.
-    """
+    """Return a server on 127.0.0.1, which other machines cannot reach, which contacts none, and lets in `page_url`."""
     library = import_viser()
     guard = PageGuard()
     with contextlib.redirect_stdout(io.StringIO()), guard.around_start():  # viser greets

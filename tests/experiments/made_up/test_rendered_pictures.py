@@ -2,26 +2,57 @@
 
 import pytest
 import torch
+import trimesh
 
-from experiments.made_up.pictures import (
-    PictureStyle,
-    camera_ring,
-    render,
-    stereo_cameras,
-    value_noise,
-)
+import torchreg as tr
+from experiments.made_up.pictures import PictureStyle, camera_ring, render, stereo_cameras, value_noise
 from experiments.made_up.videos import shape_video
-from torchreg.datasets.hand import hand_motion, placed
-from torchreg.geometry.camera import Camera
-from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 
-CAMERA = Camera.looking_at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], focal=60.0, width=48, height=40)
+CAMERA = tr.Camera.looking_at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], focal=60.0, width=48, height=40)
+SHARP = PictureStyle(noise=0.0, supersampling=1)
 
 
 @pytest.fixture(scope="module")
 def ball():
-    mesh = unit_sphere(3, dtype=torch.float64)
-    return TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.0, 0.0, 0.5]), mesh.faces)
+    mesh = trimesh.creation.icosphere(3)
+    vertices = 0.1 * torch.tensor(mesh.vertices.tolist(), dtype=torch.float64) + torch.tensor([0.0, 0.0, 0.5])
+    return tr.TriangleMesh(vertices, torch.tensor(mesh.faces.tolist()))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return stereo_cameras(width=80, height=60, focal=100.0)
+
+
+@pytest.fixture(scope="module")
+def video(plain_hand, plain_hand_surface):
+    """Return the function that renders a hand at rest, 0.6 m away."""
+    pose = plain_hand.rest_pose()
+    pose[2] += 0.6
+
+    def frame(cameras, skin=plain_hand_surface, poses=pose[None], **settings):
+        return next(iter(shape_video(plain_hand, poses, cameras, skin=skin, **settings)))
+
+    frame.pose = pose
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda video, pair, ball: PictureStyle(noise=-1.0), "noise must be zero or positive"),
+        (lambda video, pair, ball: PictureStyle(supersampling=0), "supersampling must be at least 1"),
+        (lambda video, pair, ball: PictureStyle(wall=0.0), "wall must be positive"),
+        (lambda video, pair, ball: render(ball, pair.left, torch.zeros(3, 3)), "rest must have shape"),
+        (lambda video, pair, ball: camera_ring([0, 0, 0], 1.0, 1), "count must be at least 2"),
+        (lambda video, pair, ball: value_noise(torch.zeros(2, 3), 0.0), "wavelength must be positive"),
+        (lambda video, pair, ball: video(pair, skin=tr.sample_skin(tr.Hand(), 50)), "skin must have faces"),
+        (lambda video, pair, ball: video(pair, poses=video.pose), "poses must have shape"),
+    ],
+)
+def test_bad_arguments_are_named(video, pair, ball, call, message):
+    with pytest.raises((tr.errors.InputError, tr.errors.InputTypeError), match=message):
+        call(video, pair, ball)
 
 
 def test_depth_and_mask_are_those_of_the_sphere(ball):
@@ -56,56 +87,41 @@ def test_texture_moves_with_the_surface(ball):
     still = render(ball, CAMERA, style=style)
     # Two pixels to the right at every depth: the camera turns instead of the ball.
     shifted = CAMERA.intrinsics + torch.tensor([0.0, 0.0, 2.0, 0.0], dtype=torch.float64)
-    moved = render(ball, Camera(48, 40, shifted, CAMERA.world_to_camera), style=style)
+    moved = render(ball, tr.Camera(48, 40, shifted, CAMERA.world_to_camera), style=style)
     assert torch.allclose(moved.image[:, 2:], still.image[:, :-2], atol=1e-6)
     step = ball.vertices.new_tensor([0.3, 0.0, 0.0])
-    away = TriangleMesh(ball.vertices + step, ball.faces)
-    other = Camera.looking_at(step, step + step.new_tensor([0, 0, 1]), focal=60.0, width=48, height=40)
+    away = tr.TriangleMesh(ball.vertices + step, ball.faces)
+    other = tr.Camera.looking_at(step, step + step.new_tensor([0, 0, 1]), focal=60.0, width=48, height=40)
     assert torch.allclose(render(away, other, ball.vertices, style=style).image, still.image, atol=1e-6)
 
 
-def test_hand_before_a_pair_and_in_a_ring(plain_hand, plain_hand_surface):
+def test_hand_before_a_pair_and_in_a_ring(video):
     pair = stereo_cameras(width=80, height=60, focal=75.0)
     assert pair.is_rectified
     assert pair.baseline == pytest.approx(0.12)
-    pose = placed(plain_hand, plain_hand.rest_pose(), torch.tensor([0.0, 0.0, 0.6]))
-    options = {"skin": plain_hand_surface, "forearm": False}
-    [(left, right)] = shape_video(plain_hand, pose[None], pair, style=PictureStyle(wall=0.9), **options)
+    left, right = video(pair, style=PictureStyle(wall=0.9), forearm=False)
     assert left.mask.sum() > 50
     # The disparity of the hand is about that of its distance.
     middle = [picture.mask.nonzero()[:, 1].double().mean() for picture in (left, right)]
     expected = pair.disparity(left.depth[left.mask].mean())
     assert float(middle[0] - middle[1]) == pytest.approx(float(expected), abs=1.5)
     ring = camera_ring([0.0, 0.0, 0.6], 0.5, 5, focal=50.0, width=48, height=48)
-    [pictures] = shape_video(plain_hand, pose[None], ring, **options)
+    pictures = video(ring, forearm=False)
     assert len(pictures) == len(ring) == 5
     assert all(picture.mask.sum() > 20 for picture in pictures)
     assert all(camera.project(torch.tensor([[0.0, 0.0, 0.6]]))[1].item() == pytest.approx(0.5) for camera in ring)
 
 
-@pytest.fixture(scope="module")
-def pair():
-    return stereo_cameras(width=80, height=60, focal=100.0)
-
-
-def test_video_is_what_single_pictures_show(plain_hand, plain_hand_surface, pair):
-    style = PictureStyle(wall=0.9, noise=0.0, supersampling=1)
-    (pose,) = hand_motion(plain_hand, "rotation", 1, distance=0.6)
-    (frame,) = shape_video(plain_hand, pose[None], pair, skin=plain_hand_surface, style=style, forearm=False, seed=3)
-    mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
+def test_video_is_what_single_pictures_show(video, plain_hand, plain_hand_surface, pair):
+    frame, other = (video(pair, style=SHARP, forearm=False, seed=seed) for seed in (3, 4))
+    mesh = tr.TriangleMesh(plain_hand_surface(video.pose), plain_hand_surface.faces)
     for camera, picture in zip((pair.left, pair.right), frame, strict=True):
-        single = render(mesh, camera, plain_hand_surface(plain_hand.rest_pose()), style=style, seed=3)
+        single = render(mesh, camera, plain_hand_surface(plain_hand.rest_pose()), style=SHARP, seed=3)
         assert torch.allclose(picture.image, single.image, atol=1e-6)
         assert torch.equal(picture.mask, single.mask)
-
-
-def test_the_forearm_is_seen_but_not_in_the_mask(plain_hand, plain_hand_surface, pair):
-    poses = hand_motion(plain_hand, "bend", 1, distance=0.6)
-    style = PictureStyle(noise=0.0, supersampling=1)
-    with_arm, alone = (
-        next(iter(shape_video(plain_hand, poses, pair, skin=plain_hand_surface, style=style, forearm=arm)))[0]
-        for arm in (True, False)
-    )
+    assert not torch.equal(frame[0].image, other[0].image)
+    # The forearm is visible but not in the mask.
+    with_arm, alone = video(pair, style=SHARP, forearm=True)[0], frame[0]
     assert torch.equal(alone.mask, alone.face_index >= 0)
     assert ((with_arm.face_index >= 0).sum() - alone.mask.sum()) > 100
     assert (with_arm.mask & ~alone.mask).sum() == 0

@@ -1,4 +1,4 @@
-"""The T-step: its energy against automatic differentiation of the losses, what it recovers, batches, invariances."""
+"""The T-step, with and without free joints: its energy against autograd, what it recovers, batches, invariances."""
 
 import math
 from dataclasses import replace
@@ -8,53 +8,62 @@ import torch
 
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.blend import turn_about
-from torchreg.registration.bones.correspondences import Correspondences, ScanDistance
-from torchreg.registration.bones.grid_losses import JointEnergy
 from torchreg.registration.bones.joint_moments import JointMoments
-from torchreg.registration.bones.motion_problem import Binding, BoneBodies
 from torchreg.registration.bones.motions import fit_bones
+from torchreg.registration.bones.motions_and_joints import fit_bones_and_joints
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.
 JACFWD = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+LINEARIZED = ("cost", "gradient", "hessian")
 
 
-def energy(bones, problem, model, transforms, index):
-    """E from the losses, one problem."""
-    moved = model(problem.points, transforms)
+def energy(problem, model, transforms, index=()):
+    """E by its definition, of one problem."""
+    pairs, moments = problem.correspondences, problem.moments
+    off = model(problem.points, transforms) - pairs.targets[index]
+    plane = off.square().sum(-1) if pairs.normals is None else (off * pairs.normals[index]).sum(-1).square()
+    squares = (1 - pairs.point_to_point) * plane + pairs.point_to_point * off.square().sum(-1)
+    total = (pairs.weights[index] * squares).sum() / pairs.weights[index].sum().clamp_min(1e-300)
+    difference = transforms[moments.pairs[:, 0]] - transforms[moments.pairs[:, 1]]
+    turn = difference[:, :3, :3]
+    gap = (turn @ moments.center.unsqueeze(-1)).squeeze(-1) + difference[:, :3, 3]
+    joints = gap.square().sum(-1) + ((turn @ moments.spread) * turn).sum((-1, -2))
+    total = (
+        total + problem.joint_weight * ((1.0 if problem.pair_weights is None else problem.pair_weights) * joints).sum()
+    )
+    if problem.anchors is None:
+        return total
+    shares = problem.binding.weights / problem.binding.weights.sum(0)
+    off = transform_points(transforms, problem.points) - transform_points(problem.anchors, problem.points)
+    return total + (problem.anchor_weights * (shares.mT * off.square().sum(-1)).sum(-1)).sum()
+
+
+def turned(problem, motion):
+    """Return the problem with its targets and anchors moved."""
     pairs = problem.correspondences
-    matched = pairs.targets[index], pairs.normals[index], pairs.weights[index]
-    total = ScanDistance(pairs.point_to_point)(moved, *matched)
-    total = total + problem.joint_weight * JointEnergy()(transforms, problem.moments, problem.pair_weights)
-    for bone in range(bones.COUNT):
-        off = transform_points(transforms[bone], problem.points) - transform_points(
-            problem.anchors[bone], problem.points
-        )
-        share = problem.binding.weights[:, bone]
-        total = total + problem.anchor_weights[bone] * (share * off.square().sum(-1)).sum() / share.sum()
-    return total
+    normals = None if pairs.normals is None else pairs.normals @ motion[:3, :3].mT
+    pairs = replace(pairs, targets=transform_points(motion, pairs.targets), normals=normals)
+    anchors = None if problem.anchors is None else motion @ problem.anchors
+    return replace(problem, correspondences=pairs, anchors=anchors)
 
 
 @pytest.mark.parametrize(("blend", "share"), [("linear", 0), ("linear", 0.3), ("linear", 1), ("dual_quaternion", 0.2)])
-def test_the_linearization_is_that_of_the_losses(bones, blend, share):
+def test_the_linearization_is_that_of_the_energy(bones, blend, share):
     problem, model = bones.noisy_problem(blend, float(share))
     transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
     found = problem.linearize(transforms)
-    assert found.hessian.shape == (2, 6 * bones.COUNT, 6 * bones.COUNT)
     torch.testing.assert_close(found.hessian, found.hessian.mT)
     for k in range(2):
         centers = problem.centers(transforms[k])
 
         def cost(twists, k=k, centers=centers):
-            return 0.5 * energy(
-                bones, problem, model, turn_about(transforms[k], twists.reshape(bones.COUNT, 6), centers), k
-            )
+            moved = turn_about(transforms[k], twists.reshape(bones.COUNT, 6), centers)
+            return 0.5 * energy(problem, model, moved, k)
 
         zero = torch.zeros(6 * bones.COUNT, dtype=torch.float64)
         torch.testing.assert_close(found.cost[k], cost(zero).detach())
         torch.testing.assert_close(found.gradient[k], torch.func.grad(cost)(zero), atol=1e-9, rtol=1e-7)
-        torch.testing.assert_close(
-            problem.energy(transforms)[k], energy(bones, problem, model, transforms[k], k).detach()
-        )
+    torch.testing.assert_close(problem.energy(transforms), 2 * found.cost)
 
 
 @JACFWD
@@ -63,38 +72,42 @@ def test_without_residuals_the_hessian_is_exact(bones, share):
     points, normals = bones.limb(60)
     model, transforms = bones.model_of(points, resolution=8), bones.bent()
     with torch.no_grad():
-        moved, moments = model(points, transforms), model.joint_moments()
-    weights = model.weights_at(points)
-    problem = bones.problem_of(points, weights, moved, normals, point_to_point=share)
+        moved, moments, weights = model(points, transforms), model.joint_moments(), model.weights_at(points)
     together = transforms[:1].expand(bones.COUNT, 4, 4)
-    joints = bones.problem_of(points, weights, moved, normals, torch.zeros(60).double(), moments=moments)
-    for some, at in ((problem, transforms), (joints, together)):
-        centers = some.centers(at)
+    dropped = torch.zeros(60, dtype=torch.float64)
+    for problem, at in (
+        (bones.problem_of(points, weights, moved, normals, point_to_point=share), transforms),
+        (bones.problem_of(points, weights, moved, normals, dropped, moments=moments), together),
+    ):
+        centers = problem.centers(at)
 
-        def cost(twists, some=some, at=at, centers=centers):
-            moved_on = turn_about(at, twists.reshape(bones.COUNT, 6), centers)
-            if some is joints:
-                return 0.5 * JointEnergy()(moved_on, moments)
-            return 0.5 * ScanDistance(share)(model(points, moved_on), moved, normals)
+        def cost(twists, problem=problem, at=at, centers=centers):
+            return 0.5 * energy(problem, model, turn_about(at, twists.reshape(bones.COUNT, 6), centers))
 
         expected = torch.func.hessian(cost)(torch.zeros(6 * bones.COUNT, dtype=torch.float64))
-        torch.testing.assert_close(some.linearize(at).hessian, expected, atol=1e-10, rtol=1e-8)
+        torch.testing.assert_close(problem.linearize(at).hessian, expected, atol=1e-10, rtol=1e-8)
 
 
-def test_joints_may_be_elsewhere(bones):
+def test_joints_may_be_elsewhere_and_weights_differ_between_problems(bones):
     problem, _ = bones.noisy_problem()
     transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
     joints = problem.moments.center + 0.1 * bones.draw(len(problem.moments.pairs), 3, seed=6)
-    moved = replace(problem, moments=replace(problem.moments, center=joints))
-    found, expected = problem.linearize(transforms, joints), moved.linearize(transforms)
-    for name in ("cost", "gradient", "hessian"):
+    found = problem.linearize(transforms, joints)
+    expected = replace(problem, moments=replace(problem.moments, center=joints)).linearize(transforms)
+    pairs, anchors = problem.pair_weights, problem.anchor_weights
+    scaled = {"pair_weights": 2 * pairs, "anchor_weights": 3 * anchors}
+    stacked = {name: torch.stack([getattr(problem, name), value]) for name, value in scaled.items()}
+    both, first = (replace(problem, **change).linearize(transforms) for change in (stacked, {}))
+    second = replace(problem, **scaled).linearize(transforms)
+    for name in LINEARIZED:
         torch.testing.assert_close(getattr(found, name), getattr(expected, name))
-    torch.testing.assert_close(problem.linearize(transforms).cost, problem.energy(transforms) / 2)
+        torch.testing.assert_close(getattr(both, name)[0], getattr(first, name)[0])
+        torch.testing.assert_close(getattr(both, name)[1], getattr(second, name)[1])
 
 
 def test_bindings_list_every_pair_once(bones):
     weights = torch.tensor([[0.5, 0.0, 0.5], [0.0, 1.0, 0.0], [0.2, 0.3, 0.5], [1.0, 1e-6, 0.0]])
-    found = Binding.from_weights(weights)
+    found = bones.problem_of(torch.eye(4, 3), weights, torch.eye(4, 3)).binding
     assert found.point.tolist() == [0, 0, 1, 2, 2, 2, 3]
     assert found.bone.tolist() == [0, 2, 1, 0, 1, 2, 0]
     pairs = [(0, 0), (0, 1), (1, 1), (2, 2), (3, 3), (3, 4), (3, 5), (4, 4), (4, 5), (5, 5), (6, 6)]
@@ -103,47 +116,18 @@ def test_bindings_list_every_pair_once(bones):
     assert found.num_bones == 3
 
 
-def test_bodies_are_weighted_moments(bones):
+def test_bodies_are_weighted_moments_and_inertia_is_the_mean_squared_shift(bones):
     points, weights = bones.draw(20, 3), bones.draw(20, 2, seed=1).abs()
-    weights = torch.cat([weights, torch.zeros(20, 1).double()], dim=1)
-    bodies = BoneBodies.from_weights(points, weights)
-    for bone in range(2):
-        share = weights[:, bone] / weights[:, bone].sum()
-        middle = (share[:, None] * points).sum(0)
-        torch.testing.assert_close(bodies.center[bone], middle)
-        expected = torch.cov(points.mT, correction=0, aweights=share)
-        torch.testing.assert_close(bodies.spread[bone], expected)
-    torch.testing.assert_close(bodies.center[2], points.mean(0))
-    torch.testing.assert_close(bodies.spread[2], torch.cov(points.mT, correction=0))
-
-
-def test_weights_of_joints_and_anchors_differ_between_problems(bones):
-    problem, _ = bones.noisy_problem()
-    transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
-    pairs, anchors = problem.pair_weights, problem.anchor_weights
-    both = replace(
-        problem,
-        pair_weights=torch.stack([pairs, 2 * pairs]),
-        anchor_weights=torch.stack([anchors, 3 * anchors]),
-    ).linearize(transforms)
-    other = replace(problem, pair_weights=2 * pairs, anchor_weights=3 * anchors).linearize(transforms)
-    first = problem.linearize(transforms)
-    for name in ("cost", "gradient", "hessian"):
-        found = getattr(both, name)
-        torch.testing.assert_close(found[0], getattr(first, name)[0])
-        torch.testing.assert_close(found[1], getattr(other, name)[1])
-
-
-def test_the_inertia_is_the_mean_squared_shift(bones):
-    problem, _ = bones.noisy_problem()
-    start, twists = se3_exp(0.3 * bones.draw(bones.COUNT, 6, seed=5)), 1e-4 * bones.draw(bones.COUNT, 6, seed=6)
-    moved = turn_about(start, twists, problem.centers(start))
-    shares = problem.binding.weights / problem.binding.weights.sum(0)
-    for bone in range(bones.COUNT):
-        shift = transform_points(moved[bone], problem.points) - transform_points(start[bone], problem.points)
-        expected = (shares[:, bone] * shift.square().sum(-1)).sum()
-        found = twists[bone] @ problem.inertia(start)[bone] @ twists[bone]
-        torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+    problem = bones.problem_of(points, torch.nn.functional.pad(weights, (0, 1)), points)
+    for bone, shares in enumerate([*(weights / weights.sum(0)).mT, torch.full((20,), 1 / 20).double()]):
+        torch.testing.assert_close(problem.bodies.center[bone], shares @ points)
+        expected = torch.cov(points.mT, correction=0, aweights=shares)
+        torch.testing.assert_close(problem.bodies.spread[bone], expected)
+        start, twist = se3_exp(0.3 * bones.draw(3, 6, seed=5)), 1e-4 * bones.draw(6, seed=6)
+        moved = turn_about(start, twist.expand(3, 6), problem.centers(start))
+        shift = transform_points(moved[bone], points) - transform_points(start[bone], points)
+        found = twist @ problem.inertia(start)[bone] @ twist
+        torch.testing.assert_close(found, (shares * shift.square().sum(-1)).sum(), rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
@@ -166,20 +150,14 @@ def test_joints_place_a_bone_without_matches(bones):
     model, truth = bones.model_of(points), bones.bent()
     with torch.no_grad():
         targets, weights, moments = model(points, truth), model.weights_at(points), model.joint_moments()
-    seen = (points[:, 0] < 1.8).double()
+    kept = (points[:, 0] < 1.8).double()
     start = torch.eye(4, dtype=torch.float64).repeat(bones.COUNT, 1, 1)
-    held = {"point_to_point": 1.0, "moments": moments, "joint_weight": 0.01}
-    problem = bones.problem_of(points, weights, targets, normals, seen, **held)
+    problem = bones.problem_of(points, weights, targets, normals, kept, 1.0, moments=moments, joint_weight=0.01)
     fit = fit_bones(problem, start, max_steps=50, rtol=1e-4)
     elbow = torch.tensor([[2.0, 0.1, 0.0]], dtype=torch.float64)
-    torch.testing.assert_close(
-        transform_points(fit.transforms[2], elbow), transform_points(truth[1], elbow), atol=0.02, rtol=0
-    )
-    alone = fit_bones(
-        bones.problem_of(points, weights, targets, normals, seen, moments=moments, joint_weight=0.0),
-        start,
-        max_steps=50,
-    )
+    ends = [transform_points(motion, elbow) for motion in (fit.transforms[2], truth[1])]
+    torch.testing.assert_close(*ends, atol=0.02, rtol=0)
+    alone = fit_bones(replace(problem, joint_weight=0.0), start, max_steps=50)
     torch.testing.assert_close(alone.transforms[2], start[2])
 
 
@@ -204,48 +182,29 @@ def test_batches_equal_loops_and_energy_never_rises(bones):
     assert bool((fit.energy <= problem.energy(start)).all())
     torch.testing.assert_close(fit.energy, problem.energy(fit.transforms))
     pairs = problem.correspondences
-    of_one = Correspondences(pairs.targets[1, 2], pairs.normals[1, 2], pairs.weights[1, 2], pairs.point_to_point)
-    single = replace(problem, correspondences=of_one)
-    alone = fit_bones(single, start[1, 2], max_steps=4, rtol=0.0)
-    torch.testing.assert_close(fit.transforms[1, 2], alone.transforms)
+    only = {name: getattr(pairs, name)[1, 2] for name in ("targets", "normals", "weights")}
+    single = replace(problem, correspondences=replace(pairs, **only))
+    torch.testing.assert_close(fit.transforms[1, 2], fit_bones(single, start[1, 2], max_steps=4, rtol=0.0).transforms)
     shared = fit_bones(problem, start[0, 0], max_steps=1).transforms
-    assert shared.shape == (2, 3, bones.COUNT, 4, 4)
     torch.testing.assert_close(shared[1, 2], fit_bones(single, start[0, 0], max_steps=1).transforms)
-
-
-def test_one_step_is_newtons_near_the_solution(bones):
-    points, normals = bones.limb()
-    model, truth = bones.model_of(points), bones.bent()
-    with torch.no_grad():
-        problem = bones.problem_of(points, model.weights_at(points), model(points, truth), normals, point_to_point=0.5)
-    near = turn_about(truth, 1e-3 * bones.draw(bones.COUNT, 6), problem.centers(truth))
-    after = fit_bones(problem, near, damping=1e-10, max_steps=1).transforms
-    assert float(problem.energy(after)) < 1e-4 * float(problem.energy(near))
 
 
 def test_turning_and_scaling_everything_changes_nothing_else(bones):
     problem, _ = bones.noisy_problem(batch=())
     start = se3_exp(0.3 * bones.draw(bones.COUNT, 6, seed=6))
     motion = se3_exp(torch.tensor([1.0, 2, 3, 1, -1, 0.5], dtype=torch.float64))
-    found = fit_bones(problem, start)
-    pairs = problem.correspondences
-    targets, normals = transform_points(motion, pairs.targets), pairs.normals @ motion[:3, :3].mT
-    turned = replace(
-        problem, correspondences=replace(pairs, targets=targets, normals=normals), anchors=motion @ problem.anchors
-    )
-    torch.testing.assert_close(fit_bones(turned, motion @ start).transforms, motion @ found.transforms)
-    size = 1e3
-    moments = problem.moments
-    wide_moments = JointMoments(moments.pairs, size**3 * moments.mass, size * moments.center, size**2 * moments.spread)
+    found = fit_bones(problem, start).transforms
+    torch.testing.assert_close(fit_bones(turned(problem, motion), motion @ start).transforms, motion @ found)
+    size, pairs, moments = 1e3, problem.correspondences, problem.moments
     wide = replace(
         problem,
         points=size * problem.points,
         correspondences=replace(pairs, targets=size * pairs.targets),
-        moments=wide_moments,
-        bodies=BoneBodies(size * problem.bodies.center, size**2 * problem.bodies.spread),
+        moments=JointMoments(moments.pairs, size**3 * moments.mass, size * moments.center, size**2 * moments.spread),
+        bodies=replace(problem.bodies, center=size * problem.bodies.center, spread=size**2 * problem.bodies.spread),
         anchors=scaled(problem.anchors, size),
     )
-    torch.testing.assert_close(fit_bones(wide, scaled(start, size)).transforms, scaled(found.transforms, size))
+    torch.testing.assert_close(fit_bones(wide, scaled(start, size)).transforms, scaled(found, size))
 
 
 def scaled(motions, size):
@@ -259,8 +218,8 @@ def test_flat_matches_do_not_slide(bones, dtype):
     plane = torch.cat([bones.draw(100, 2), torch.zeros(100, 1)], dim=-1).to(dtype)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=dtype).expand(100, 3)
     weights = torch.nn.functional.one_hot((plane[:, 0] > 0).long(), 2).to(dtype)
-    start = torch.eye(4, dtype=dtype).repeat(2, 1, 1)
     tilted = plane + torch.tensor([0.3, 0.2, 0.1], dtype=dtype) + 0.05 * plane[:, :1] * up
+    start = torch.eye(4, dtype=dtype).repeat(2, 1, 1)
     fit = fit_bones(bones.problem_of(plane, weights, tilted, up), start, max_steps=20, rtol=0.0)
     assert float(fit.energy) < 1e-8
     assert float(fit.transforms[:, :2, 3].abs().max()) < 0.02
@@ -271,15 +230,100 @@ def test_dropped_matches_and_idle_bones_do_no_harm(bones, dtype):
     points, normals = (value.to(dtype) for value in bones.limb())
     weights = torch.zeros(len(points), 4, dtype=dtype)
     weights[:, 1] = 1
+    kept = (points[:, 0] > 0.3).to(dtype)
     targets = points + torch.tensor([0.0, 0.1, 0], dtype=dtype)
-    seen = (points[:, 0] > 0.3).to(dtype)
-    targets = torch.where(seen.unsqueeze(-1) > 0, targets, math.nan)
-    normals = torch.where(seen.unsqueeze(-1) > 0, normals, math.nan)
+    targets, normals = (torch.where(kept.unsqueeze(-1) > 0, value, math.nan) for value in (targets, normals))
     start = torch.eye(4, dtype=dtype).repeat(4, 1, 1)
-    problem = bones.problem_of(points, weights, targets, normals, seen, point_to_point=0.2)
-    fit = fit_bones(problem, start, max_steps=10)
+    fit = fit_bones(bones.problem_of(points, weights, targets, normals, kept, 0.2), start, max_steps=10)
     assert fit.transforms.dtype == dtype
     assert float(fit.energy) < 1e-9
     assert torch.equal(fit.transforms[[0, 2, 3]], start[:3])
-    nothing = fit_bones(bones.problem_of(points, weights, targets, normals, torch.zeros_like(seen)), start)
+    nothing = fit_bones(bones.problem_of(points, weights, targets, normals, torch.zeros_like(kept)), start)
     assert torch.equal(nothing.transforms, start)
+
+
+PIVOTS = torch.tensor([[1.0, 0.05, 0.0], [2.0, 0.1, 0.0]], dtype=torch.float64)
+SURFACE = PIVOTS + torch.tensor([0.05, 0.1, 0.1], dtype=torch.float64)
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def frames(bones):
+    """Motions (F, 3, 4, 4) of the limb, bent about changing axes, its problem with joints at the surface, and rest."""
+    vectors = 0.5 * bones.draw(FRAMES, 2, 3, seed=7)
+    motions = [torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)]
+    for joint, pivot in enumerate(PIVOTS):
+        motions.append(motions[-1] @ torch.stack([bones.turned_about(pivot, each) for each in vectors[:, joint]]))
+    truth = se3_exp(0.2 * bones.draw(FRAMES, 1, 6, seed=8)) @ torch.stack(motions, dim=1)
+    points, normals = bones.limb()
+    model = bones.model_of(points)
+    with torch.no_grad():
+        targets, weights = model(points, truth), model.weights_at(points)
+    directions = torch.nn.functional.normalize(
+        torch.einsum("nb,fbij,nj->fni", weights, truth[..., :3, :3], normals), dim=-1
+    )
+    pairs = torch.tensor([[0, 1], [1, 2]])
+    moments = JointMoments(pairs, torch.ones(2).double(), SURFACE, torch.zeros(2, 3, 3).double())
+
+    def problem(noise=0.0, share=1.0, joint_weight=1.0):
+        noisy = targets + noise * bones.draw(*targets.shape, seed=9)
+        return bones.problem_of(
+            points, weights, noisy, directions, None, share, moments=moments, joint_weight=joint_weight
+        )
+
+    return truth, problem, torch.eye(4, dtype=torch.float64).repeat(FRAMES, bones.COUNT, 1, 1)
+
+
+def test_joints_behind_motions_are_found(frames):
+    truth, problem, rest = frames
+    fit = fit_bones_and_joints(problem(), rest, SURFACE, regularization=1e-9, max_steps=40, rtol=1e-9)
+    torch.testing.assert_close(fit.centers, PIVOTS, atol=1e-3, rtol=0)
+    torch.testing.assert_close(fit.transforms, truth, atol=1e-3, rtol=0)
+    assert bool((fit.energy < 1e-6).all())
+
+
+def test_nothing_near_has_less_energy(frames, bones):
+    _, problem, rest = frames
+    problem = replace(problem(0.02, 0.3), pair_weights=torch.tensor([0.5, 2.0]).double(), joint_weight=0.1)
+    fit = fit_bones_and_joints(problem, rest, SURFACE, regularization=0.05, max_steps=60, rtol=0.0)
+    middles, model = problem.centers(fit.transforms), bones.model_of(problem.points)
+
+    def total(twists, centers):
+        motions = turn_about(fit.transforms, twists, middles)
+        placed = replace(problem, moments=replace(problem.moments, center=centers))
+        away = FRAMES * problem.joint_weight * 0.05 * (centers - SURFACE).square().sum()
+        return away + sum(energy(placed, model, motions[frame], frame) for frame in range(FRAMES))
+
+    zero = torch.zeros(FRAMES, bones.COUNT, 6, dtype=torch.float64)
+    for slope in torch.func.grad(total, argnums=(0, 1))(zero, fit.centers):
+        torch.testing.assert_close(slope, torch.zeros_like(slope), atol=2e-6, rtol=0)
+    away = FRAMES * problem.joint_weight * 0.05 * (fit.centers - SURFACE).square().sum()
+    torch.testing.assert_close(fit.energy.sum() + away, total(zero, fit.centers).detach())
+
+
+def test_a_motion_of_everything_changes_no_joint(frames, bones):
+    _, problem, rest = frames
+    problem, motion = problem(0.02, 0.2), se3_exp(bones.draw(6, seed=10))
+    alone = fit_bones_and_joints(problem, rest, SURFACE)
+    moved = fit_bones_and_joints(turned(problem, motion), motion @ rest, SURFACE)
+    torch.testing.assert_close(moved.centers, alone.centers)
+    torch.testing.assert_close(moved.transforms, motion @ alone.transforms)
+
+
+def test_energy_falls_from_any_start_and_few_steps_are_enough(frames, bones):
+    problem = frames[1](0.02, 0.2)
+    first = se3_exp(0.3 * bones.draw(FRAMES, bones.COUNT, 6, seed=11))
+    energies = [fit_bones_and_joints(problem, first, PIVOTS, max_steps=steps, rtol=0.0).energy for steps in (1, 3, 9)]
+    assert energies[0].sum() > energies[1].sum() > energies[2].sum()
+    done = fit_bones_and_joints(problem, first, PIVOTS, max_steps=100)
+    torch.testing.assert_close(done.energy.sum(), energies[2].sum(), rtol=0.01, atol=0)
+
+
+def test_bones_without_matches_follow_their_joints(frames):
+    _, problem, rest = frames
+    problem = problem()
+    kept = (problem.points[:, 0] < 1.8).double().expand(FRAMES, -1)
+    problem = replace(problem, correspondences=replace(problem.correspondences, weights=kept))
+    fit = fit_bones_and_joints(problem, rest, PIVOTS, max_steps=40, rtol=1e-9)
+    ends = [transform_points(fit.transforms[:, bone], fit.centers[1:]) for bone in (1, 2)]
+    torch.testing.assert_close(*ends, atol=1e-3, rtol=0)

@@ -6,11 +6,11 @@ import pytest
 import safetensors.torch
 import torch
 
-from torchreg.errors import InputError, InputTypeError
+import torchreg as tr
 from torchreg.geometry.rigid import se3_exp
-from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
+InputError, InputTypeError = tr.errors.InputError, tr.errors.InputTypeError
 BLENDS = pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
 GRID = ("grid_cells", "grid_shape", "grid_origin", "grid_axes", "grid_spacing", "blend_number")
 
@@ -25,7 +25,7 @@ def cloud(seed=0):
 
 def random_model(blend="linear", batch=(2,), seed=0, resolution=7):
     grid = SparseGrid.from_points(cloud(seed), resolution)
-    model = GridLBS(grid, draw(grid.num_corners, 3).abs(), se3_exp(0.7 * draw(*batch, 3, 6)), blend=blend)
+    model = tr.GridLBS(grid, draw(grid.num_corners, 3).abs(), se3_exp(0.7 * draw(*batch, 3, 6)), blend=blend)
     with torch.no_grad():
         model.twists.add_(0.2 * draw(*batch, 3, 6, seed=1))
     return model
@@ -70,7 +70,7 @@ def test_a_state_gives_the_model_back(tmp_path, blend, dtype):
     assert [name for name, value in model.named_parameters()] == ["weights", "twists"]
     safetensors.torch.save_file(model.state_dict(), tmp_path / "model.safetensors")
     for state in (model.state_dict(), safetensors.torch.load_file(tmp_path / "model.safetensors")):
-        again = GridLBS.from_state_dict(state)
+        again = tr.GridLBS.from_state_dict(state)
         assert again.blend == blend
         assert again.weights.dtype == dtype
         assert torch.equal(again(points), model(points))
@@ -82,19 +82,15 @@ def test_a_state_gives_the_model_back(tmp_path, blend, dtype):
     with torch.no_grad():
         again.weights.zero_()
     assert bool((model.weights > 0).any())
-
-
-def test_a_state_in_the_middle_of_an_optimization_is_one_too():
-    model = random_model()
     with torch.no_grad():
+        # In the middle of an optimization weights may be negative.
         model.weights[0] = torch.tensor([-1.0, 0.0, 0.5])
-        model.weights[1] = 0.0
-    assert torch.equal(GridLBS.from_state_dict(model.state_dict()).weights, model.weights)
+    assert torch.equal(tr.GridLBS.from_state_dict(model.state_dict()).weights, model.weights)
 
 
 def test_an_object_of_the_same_grid_takes_a_state_over():
     model, points = random_model("dual_quaternion"), cloud(1)
-    fresh = GridLBS(model.grid, torch.ones_like(model.weights), torch.eye(4).double().repeat(2, 3, 1, 1))
+    fresh = tr.GridLBS(model.grid, torch.ones_like(model.weights), torch.eye(4).double().repeat(2, 3, 1, 1))
     fresh.load_state_dict(model.state_dict())
     assert torch.equal(fresh(points), model(points))
     assert fresh.blend == "dual_quaternion"
@@ -115,18 +111,18 @@ def test_a_state_within_a_larger_module():
     larger.load_state_dict(other.state_dict())
     assert torch.equal(larger["scan"](cloud(1)), model(cloud(1)))
     with pytest.raises(InputError, match=r"lacks weights, .* has scan\.weights, .*without their prefix"):
-        GridLBS.from_state_dict(other.state_dict())
+        tr.GridLBS.from_state_dict(other.state_dict())
 
 
 def test_states_from_before_grids_were_part_of_them_are_taken():
     model = random_model()
     former = {name: value for name, value in model.state_dict().items() if name not in GRID}
     assert len(former) == 4
-    fresh = GridLBS(model.grid, torch.ones_like(model.weights), model.transforms)
+    fresh = tr.GridLBS(model.grid, torch.ones_like(model.weights), model.transforms)
     fresh.load_state_dict(former)
     assert torch.equal(fresh(cloud(1)), model(cloud(1)))
     with pytest.raises(InputError, match="lacks grid_cells, grid_shape, grid_origin, grid_axes, grid_spacing, blend"):
-        GridLBS.from_state_dict(former)
+        tr.GridLBS.from_state_dict(former)
 
 
 def test_states_of_other_grids_are_refused():
@@ -158,19 +154,20 @@ def test_states_of_other_grids_are_refused():
         (lambda s: s.update(grid_cells=s["grid_cells"].double()), InputTypeError, "cells must hold integers"),
         (lambda s: s["grid_axes"].mul_(2), InputError, "axes must be a rotation"),
         (lambda s: s["grid_spacing"].mul_(-1), InputError, "spacing must be positive"),
-        (lambda s: s.update(blend_number=torch.tensor(7)), InputError, "blend_number must be from 0 to 1, got 7"),
+        (
+            lambda s: s.update(blend_number=torch.tensor(7)),
+            InputError,
+            "blend_number must be from 0 to 1, got 7",
+        ),
     ],
 )
 def test_foreign_states_are_refused_by_name(change, error, message):
     state = {name: value.detach().clone() for name, value in random_model().state_dict().items()}
     change(state)
     with pytest.raises(error, match=message):
-        GridLBS.from_state_dict(state)
-
-
-def test_what_is_no_state_is_refused():
+        tr.GridLBS.from_state_dict(state)
     with pytest.raises(InputTypeError, match=r"state must be the state_dict\(\) of a GridLBS, got GridLBS"):
-        GridLBS.from_state_dict(random_model())
+        tr.GridLBS.from_state_dict(random_model())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -179,4 +176,4 @@ def test_on_a_graphics_card():
     numbers = {"grid_shape", "grid_spacing", "blend_number"}
     assert {name for name, value in model.state_dict().items() if not value.is_cuda} == numbers
     assert torch.equal(model.project_().weights.cpu(), random_model().project_().weights)
-    assert GridLBS.from_state_dict(model.state_dict()).weights.is_cuda
+    assert tr.GridLBS.from_state_dict(model.state_dict()).weights.is_cuda

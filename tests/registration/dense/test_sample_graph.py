@@ -1,9 +1,11 @@
+"""Graphs of samples: along the surface, around valleys, across gaps."""
+
 import math
 
 import pytest
 import torch
 
-from torchreg.errors import InputError
+import torchreg as tr
 from torchreg.registration.dense.sample_graph import sample_graph
 
 
@@ -30,8 +32,8 @@ def loop():
 def test_surfaces_that_face_each_other_do_not_meet():
     points, normals, length = loop()
     near, around = (
-        float(sample_graph(points, torch.arange(length), **told).distances(torch.tensor([0]))[0, -1])
-        for told in ({}, {"normals": normals, "normal_scale": 0.03})
+        float(sample_graph(points, torch.arange(length), **given).distances(torch.tensor([0]))[0, -1])
+        for given in ({}, {"normals": normals, "normal_scale": 0.03})
     )
     assert near < 0.1
     # The loop is 2.622 long, and begins and ends 0.04 from the middle.
@@ -46,8 +48,8 @@ def test_where_nothing_leads_around_parts_hang_together_across_a_valley():
     normals = torch.eye(3, dtype=torch.float64)[[2] * len(floor) + [0] * len(wall)]
     samples = torch.arange(len(points))
     plain = sample_graph(points, samples, bridge=None)
-    told = sample_graph(points, samples, normals=normals, normal_scale=0.03, bridge=None)
-    torch.testing.assert_close(told.distances(), plain.distances())
+    facing = sample_graph(points, samples, normals=normals, normal_scale=0.03, bridge=None)
+    torch.testing.assert_close(facing.distances(), plain.distances())
 
 
 def test_a_smooth_surface_is_joined_as_without_normals():
@@ -56,8 +58,8 @@ def test_a_smooth_surface_is_joined_as_without_normals():
     samples = torch.arange(150)
     plain = sample_graph(points, samples)
     for side in (1.0, -1.0):
-        told = sample_graph(points, samples, normals=side * points)
-        assert torch.equal(told.edges()[0], plain.edges()[0])
+        facing = sample_graph(points, samples, normals=side * points)
+        assert torch.equal(facing.edges()[0], plain.edges()[0])
 
 
 def test_steps_join_neighbors_alone():
@@ -68,27 +70,24 @@ def test_steps_join_neighbors_alone():
     length = (points[samples][edges[:, 0]] - points[samples][edges[:, 1]]).norm(dim=-1)
     torch.testing.assert_close(lengths, length)
     assert float(length.max()) < 3
-    ways = graph.distances()
+    geodesics = graph.distances()
     straight = torch.cdist(points[samples], points[samples])
-    assert bool((ways >= straight - 1e-9).all())
-    assert bool((ways <= 1.45 * straight + 1e-9).all())
-    torch.testing.assert_close(ways, ways.mT)
+    assert bool((geodesics >= straight - 1e-9).all())
+    assert bool((geodesics <= 1.45 * straight + 1e-9).all())
+    torch.testing.assert_close(geodesics, geodesics.mT)
 
 
-def test_all_points_as_samples_give_the_edges_of_the_mesh():
-    points, faces = sheet(4)
-    graph = sample_graph(points, torch.arange(16), faces)
-    sides = torch.cat((faces[:, :2], faces[:, 1:], faces[:, ::2])).sort(dim=1).values.unique(dim=0)
-    assert torch.equal(graph.edges()[0], sides)
-
-
-def test_limits_leave_far_samples_out():
+def test_all_points_as_samples_give_the_edges_of_the_mesh_and_limits_leave_far_ones_out():
     points, faces = sheet(5)
     graph = sample_graph(points, torch.arange(25), faces)
-    near = graph.distances(torch.tensor([0, 24]), limit=1.5)
-    assert near.shape == (2, 25)
-    full = graph.distances(torch.tensor([0, 24]))
+    sides = torch.cat((faces[:, :2], faces[:, 1:], faces[:, ::2])).sort(dim=1).values.unique(dim=0)
+    assert torch.equal(graph.edges()[0], sides)
+    ends = torch.tensor([0, 24])
+    near, full = graph.distances(ends, limit=1.5), graph.distances(ends)
     assert torch.equal(near.isfinite(), full <= 1.5)
+    alone = sample_graph(points, torch.tensor([4]), faces)
+    assert alone.edges()[0].shape == (0, 2)
+    assert alone.distances().tolist() == [[0.0]]
 
 
 def test_parts_are_bridged_where_they_are_nearest():
@@ -107,9 +106,9 @@ def test_points_without_faces_are_joined_to_neighbors():
     points, _ = sheet(6)
     twice = torch.cat((points, points[:7]))
     graph = sample_graph(twice, torch.arange(36), None)
-    ways = graph.distances()
-    assert bool(ways.isfinite().all())
-    assert float(ways[0, 35]) == pytest.approx(5 * 2**0.5, rel=0.2)
+    geodesics = graph.distances()
+    assert bool(geodesics.isfinite().all())
+    assert float(geodesics[0, 35]) == pytest.approx(5 * 2**0.5, rel=0.2)
 
 
 def test_motion_and_order_change_nothing():
@@ -124,13 +123,6 @@ def test_motion_and_order_change_nothing():
     torch.testing.assert_close(other.distances().flip(0, 1), graph.distances())
 
 
-def test_one_sample_has_no_steps():
-    points, faces = sheet(3)
-    graph = sample_graph(points, torch.tensor([4]), faces)
-    assert graph.edges()[0].shape == (0, 2)
-    assert graph.distances().tolist() == [[0.0]]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"samples": torch.zeros(0, dtype=torch.long)}, "samples must be"), ({"bridge": 0.0}, "bridge must be"),
@@ -141,5 +133,5 @@ def test_one_sample_has_no_steps():
 def test_bad_input_is_named(change, message):
     points, faces = sheet(3)
     arguments = {"points": points, "samples": torch.arange(9), "faces": faces, **change}
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(tr.errors.InputError, match=message):
         sample_graph(**arguments)

@@ -1,101 +1,107 @@
+"""Problems of two scans: what they hold, how motions are judged, fused from several and trusted."""
+
 from dataclasses import replace
 
 import pytest
 import torch
 
-from experiments.made_up.walks import walking_figure
-from torchreg.datasets.depth_scanner import DepthScanner
+from experiments.made_up.walks import walking_animal, walking_figure
 from torchreg.geometry.rigid import se3_exp
-from torchreg.registration.dense.config import ScanAlignConfig
+from torchreg.registration.dense.align_scans import align_scans
+from torchreg.registration.dense.fusion import fuse_motions
+from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.problem import ExpectedPlaces, describe
-from torchreg.registration.dense.stages import (
-    Reporter,
-    agree,
-    deviations,
-    judge,
-    mismatch,
-    refine,
-    uncovered,
-)
-
-CONFIG = ScanAlignConfig(num_samples=400, num_nodes=30)
+from torchreg.registration.dense.reliability import scan_evidence
+from torchreg.registration.dense.stages import judge
 
 
-@pytest.fixture(scope="module")
-def pair():
-    return walking_figure(3, scanner=DepthScanner(num_points=1500)).pair(0, 1)
+def test_samples_are_normalized_and_belong_to_the_scans(pair, problem):
+    assert problem.unit.scale == pytest.approx(pair.source.diagonal, rel=0.3)
+    assert float(problem.source.points.mean(0).norm()) < 1e-6
+    torch.testing.assert_close(problem.unit.normalize(pair.source.points[problem.samples]), problem.graph.points)
+    torch.testing.assert_close(problem.unit.normalize(pair.source.points[problem.nodes]), problem.graph.centers)
+    assert (len(problem.nodes), len(problem.target)) == (40, 800)
+    rest = problem.moved(problem.graph.rest())
+    torch.testing.assert_close(rest.points, problem.source.points[:400])
+    torch.testing.assert_close(rest.normals, problem.source.normals[:400])
 
 
-@pytest.fixture(scope="module")
-def problem(pair):
-    return describe(pair.source, pair.target, CONFIG)
+def test_frames_and_units_change_nothing(pair, problem, quick):
+    motion = se3_exp(torch.tensor([0.3, 2.0, -1.0, 0.5, 1.0, 2.0], dtype=torch.float64))
+    motion[:3] = 7 * motion[:3]
+    moved = describe(*(scan.to(torch.float64).transformed(motion) for scan in (pair.source, pair.target)), quick)
+    assert moved.unit.scale == pytest.approx(7 * problem.unit.scale, rel=1e-5)
+    assert torch.equal(moved.samples, problem.samples)
+    assert torch.equal(moved.nodes, problem.nodes)
 
 
-@pytest.fixture
-def reporter():
-    records = []
-    return Reporter("some", 2.0, records.append), records
+def capped(prior, points, others, cap):
+    """Return the mean of squared distances, in caps, at most one, of what is visible with a probability."""
+    apart = torch.cdist(points, others).amin(1) / cap
+    return float((prior * apart.clamp(max=1).square()).mean())
 
 
-def residual(pair, problem, transforms):
-    truth = problem.unit.normalize(pair.truth[problem.samples])
-    return (problem.graph(transforms) - truth).norm(dim=-1)
-
-
-def test_steps_come_nearer_and_report(pair, problem, reporter):
-    rest = problem.graph.rest()
-    moved = refine(problem, rest, reporter[0])
-    assert float(residual(pair, problem, moved).mean()) < float(residual(pair, problem, rest).mean())
-    assert [record.step for record in reporter[1]] == list(range(20))
-    widths = [record.width for record in reporter[1]]
-    assert widths == sorted(widths, reverse=True)
-    assert (widths[0], widths[-1]) == pytest.approx((2 * 0.02, 2 * 0.006))
-    assert all(record.hypothesis == "some" and record.stage == "refine" for record in reporter[1])
-
-
-def test_leaps_cost_their_distance_up_to_a_cap(problem):
-    rest = problem.graph.rest()
-    places = problem.graph(rest)
-    assert float(deviations(problem, places).max()) == 0
+@pytest.mark.parametrize("shift", [0.0, 0.02, 10.0])
+def test_judged_are_distances_both_ways_what_the_graph_bends_and_leaps(problem, quick, shift):
+    motions = problem.graph.rest()
+    motions[::3, 0, 3] += shift
+    motions[..., 2, 3] += shift
+    moved, prior = problem.moved(motions).points, problem.prior
+    found = judge(problem, "some", motions)
+    assert found.forward == pytest.approx(capped(prior.visible[:400], moved, problem.target.points, quick.cap))
+    assert found.backward == pytest.approx(capped(prior.target_visible, problem.target.points, moved, quick.cap))
+    assert found.smoothness == pytest.approx(quick.smoothness * float(problem.graph.smoothness(motions)))
+    assert (found.name, found.deviation) == ("some", 0)
+    assert found.energy == pytest.approx(found.forward + found.backward + found.smoothness)
+    # A leap costs its squared distance in three stds, at most one.
     for distance, cost in ((0.0, 0.0), (0.015, 0.25), (0.03, 1.0), (7.0, 1.0)):
-        away = replace(problem, expected=ExpectedPlaces(places + distance * torch.tensor([0.6, 0.0, -0.8]), 0.01))
-        torch.testing.assert_close(deviations(away, places), torch.full_like(places[:, 0], cost))
-        assert judge(away, "", rest).deviation == pytest.approx(cost)
+        away = ExpectedPlaces(moved + distance * torch.tensor([0.6, 0.0, -0.8]).double(), 0.01)
+        leap = judge(replace(problem, expected=away), "", motions)
+        assert leap.deviation == pytest.approx(cost, rel=1e-6)
+        assert leap.energy == pytest.approx(found.energy + cost)
 
 
-def test_better_hypotheses_are_judged_better(problem, reporter):
-    rest = problem.graph.rest()
-    moved = refine(problem, rest, reporter[0])
-    still, better = judge(problem, "still", rest), judge(problem, "better", moved)
-    assert better.energy < still.energy
-    assert still.smoothness == 0
-    assert still.energy == pytest.approx(still.forward + still.backward)
-    far = rest.clone()
-    far[:, :3, 3] += 10
-    lost = judge(problem, "lost", far)
-    # As much as each scan shows the other.
-    prior = problem.prior
-    assert lost.forward == pytest.approx(float(prior.visible[: len(problem.samples)].mean()))
-    assert lost.backward == pytest.approx(float(prior.target_visible.mean()))
+@pytest.fixture(scope="module")
+def halves(scanner, quick):
+    """A problem, the true motion, and two motions that are true in one half each and off in the other."""
+    pair = walking_figure(6, scanner=scanner).pair(0, 5)
+    problem = describe(pair.source, pair.target, quick)
+    graph, truth = problem.graph, problem.unit.normalize(pair.truth[problem.samples])
+    right = fit_graph(graph, graph.rest(), GraphMatches.of_places(truth), 0.01, num_steps=8).transforms
+    off = se3_exp(torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)) @ right
+    axis = (graph.centers - graph.centers.mean(0)).square().sum(0).argmax()
+    upper = (graph.centers[:, axis] > graph.centers[:, axis].median())[:, None, None]
+    return problem, right, torch.stack([torch.where(upper, right, off), torch.where(upper, off, right)])
 
 
-def test_distances_from_the_target_count_up_to_a_cap(problem):
-    visible = problem.prior.visible
-    target = problem.target.first(len(visible))
-    cost, index = mismatch(problem, target)
-    assert float(cost.max()) == 0
-    assert torch.equal(index, torch.arange(len(target)))
-    assert float(uncovered(problem, problem.target).max()) == 0
-    above = target.moved(target.points + torch.tensor([0.0, 0.0, 10.0]), target.normals)
-    torch.testing.assert_close(mismatch(problem, above)[0], visible)
-    torch.testing.assert_close(uncovered(problem, above), problem.prior.target_visible)
+def test_each_part_moves_as_where_it_is_right(halves):
+    problem, right, options = halves
+    for given in (options, options.flip(0)):
+        fused = fuse_motions(problem, given)
+        assert float((fused == right).all((1, 2)).double().mean()) > 0.9
+    least, energy, *energies = (judge(problem, "", motion).energy for motion in (right, fused, *options))
+    # Nearly all that could be gained is, whatever the truth itself costs.
+    assert energy - least < 0.1 * (min(energies) - least)
+    for nothing_better in (right[None], torch.stack([right, right]), torch.stack([right, *options])):
+        assert torch.equal(fuse_motions(problem, nothing_better), right)
 
 
-def test_hypotheses_agree_up_to_the_last_sigma(problem):
-    rest = problem.graph.rest()
-    whole = se3_exp(torch.tensor([0.003, 0, 0, 0, 0, 0], dtype=torch.float64)).expand_as(rest)
-    assert agree(problem, rest, whole)
-    assert not agree(problem, rest, 3 * whole - 2 * rest)
-    one = rest.clone()
-    one[3, 0, 3] += 0.3
-    assert not agree(problem, rest, one)
+def test_alignments_of_one_thing_are_trusted_and_of_two_are_not(pair, aligned, scanner, quick):
+    other = walking_animal(2, scanner=scanner)[0]
+    wrong = align_scans(pair.source, other, quick).confidence
+    assert 0 < wrong < 0.3
+    assert 0.7 < aligned.confidence < 1
+    lifted = pair.target.shifted(torch.tensor([0.0, 0.0, 0.1]) * pair.source.diagonal)
+    assert align_scans(pair.source, lifted, quick).confidence == pytest.approx(aligned.confidence, abs=0.2)
+
+
+def test_evidence_is_what_is_judged_of_visible_points_and_their_support(problem, quick):
+    motions, prior = problem.graph.rest(), problem.prior
+    motions[:, 0, 3] += 0.02
+    judged, found = judge(problem, "some", motions), scan_evidence(problem, motions, 0.3)
+    assert found.forward == pytest.approx(judged.forward / float(prior.visible[:400].mean()))
+    assert found.backward == pytest.approx(judged.backward / float(prior.target_visible.mean()))
+    nearest = torch.cdist(problem.moved(motions).points, problem.target.points).argmin(1)
+    support = prior.logarithm(nearest[:, None], quick.doubt)[:, 0]
+    assert found.unsupported == pytest.approx(-float((prior.visible * support).sum() / prior.visible.sum()))
+    assert (found.hidden, found.smoothness) == (pytest.approx(1 - float(prior.visible.mean())), 0.3)

@@ -1,11 +1,11 @@
-"""Seeds far apart, cells that follow the nearest one, and unused labels for halves of the worst regions."""
+"""Seeds far apart, and unused labels for halves of the worst regions."""
 
 import pytest
 import torch
 
 from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
-from torchreg.registration.paper.segmentation import best_candidates, nearest_seed, reuse_labels
+from torchreg.registration.paper.segmentation import best_candidates, reuse_labels
 
 
 def generator(seed=0):
@@ -30,21 +30,11 @@ def test_best_candidates_lie_farther_apart_than_random_points(sheet):
     assert sum(best) > 2 * sum(plain)
 
 
-def test_seeds_are_those_of_the_generator(sheet):
+def test_seeds_are_those_of_the_generator_and_no_more_than_points(sheet):
     first, again, other = (best_candidates(sheet.points, 7, generator(seed)) for seed in (3, 3, 4))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
-
-
-def test_fewer_points_than_seeds_give_as_many_seeds():
     assert best_candidates(torch.zeros(2, 3), 5, generator()).shape == (5,)
-
-
-def test_the_nearest_seed_is_that_of_a_search_through_all(sheet):
-    seeds = sheet.points[:9]
-    found = nearest_seed(sheet.points[:50], seeds)
-    for point, label in zip(sheet.points[:50], found.tolist(), strict=True):
-        assert label == min(range(9), key=lambda seed: float((point - seeds[seed]).norm()))
 
 
 def split(sheet, squares, num_bones, least=0.01):

@@ -1,11 +1,12 @@
+"""Spin images by a plain loop, and how alike two of them are by the definitions."""
+
 import math
 
 import pytest
 import torch
 
-from torchreg.errors import InputError, InputTypeError
+import torchreg as tr
 from torchreg.geometry.rigid import se3_exp, transform_points
-from torchreg.registration.paper import spin_images as module
 from torchreg.registration.paper.spin_images import image_similarity, spin_images
 
 
@@ -16,11 +17,11 @@ def cloud(count=200, seed=0, dtype=torch.float64):
     return points, normals
 
 
-def plain_images(points, normals, seen, seen_normals, bin_size, size, angle, interpolate):
+def plain_images(points, normals, scan, scan_normals, bin_size, size, angle, interpolate):
     """Johnson's definition, one number at a time."""
     images = torch.zeros(len(points), size, size, dtype=points.dtype)
     for image, (p, n) in enumerate(zip(points, normals, strict=True)):
-        for x, m in zip(seen, seen_normals, strict=True):
+        for x, m in zip(scan, scan_normals, strict=True):
             if math.acos(max(-1.0, min(1.0, float(n @ m)))) >= angle:
                 continue
             beta = float(n @ (x - p))
@@ -51,31 +52,22 @@ def test_images_are_those_of_a_plain_loop(interpolate, size, angle):
     assert float(images.sum()) > 10
 
 
-def test_rigid_motions_change_nothing_and_scale_goes_with_the_bin():
+def test_motions_units_order_and_chunks_change_nothing(monkeypatch):
     points, normals = cloud()
     images = spin_images(points, normals, points, normals, bin_size=0.05)
     motion = se3_exp(torch.tensor([3.0, -2, 5, 1, 2, -0.5], dtype=torch.float64))
     moved, turned = transform_points(motion, points), normals @ motion[:3, :3].mT
     torch.testing.assert_close(spin_images(moved, turned, moved, turned, bin_size=0.05), images)
-    scaled = spin_images(1e3 * points, normals, 1e3 * points, normals, bin_size=50.0)
-    torch.testing.assert_close(scaled, images)
-
-
-def test_the_order_of_points_does_not_matter():
-    points, normals = cloud()
-    images = spin_images(points, normals, points, normals, bin_size=0.05)
+    torch.testing.assert_close(spin_images(1e3 * points, normals, 1e3 * points, normals, bin_size=50.0), images)
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(2))
-    torch.testing.assert_close(spin_images(points, normals, points[order], normals[order], bin_size=0.05), images)
-    torch.testing.assert_close(
-        spin_images(points[order], normals[order], points, normals, bin_size=0.05), images[order]
-    )
-
-
-def test_chunks_change_nothing(monkeypatch):
-    points, normals = cloud()
-    images = spin_images(points, normals, points, normals, bin_size=0.05)
-    monkeypatch.setattr(module, "_CHUNK_ENTRIES", 700)
-    torch.testing.assert_close(spin_images(points, normals, points, normals, bin_size=0.05), images)
+    monkeypatch.setattr("torchreg.registration.paper.spin_images._CHUNK_ENTRIES", 700)
+    mixed = spin_images(points[order], normals[order], points, normals, bin_size=0.05)
+    torch.testing.assert_close(mixed, images[order])
+    far, directions = (points + 64).float(), normals.float()
+    single = spin_images(far, directions, far, directions, bin_size=0.1)
+    assert single.dtype == torch.float32
+    expected = spin_images(points, normals, points, normals, bin_size=0.1)
+    torch.testing.assert_close(single.double(), expected, atol=0.01, rtol=0)
 
 
 def test_weights_count_points_and_missing_normals_count_all():
@@ -87,15 +79,6 @@ def test_weights_count_points_and_missing_normals_count_all():
     torch.testing.assert_close(
         blind, spin_images(points, normals, points, normals, bin_size=0.1, support_angle=math.pi)
     )
-
-
-def test_single_precision_far_from_zero():
-    points, normals = cloud()
-    images = spin_images(points, normals, points, normals, bin_size=0.1)
-    far = (points + 64).float()
-    single = spin_images(far, normals.float(), far, normals.float(), bin_size=0.1)
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), images, atol=0.01, rtol=0)
 
 
 @pytest.mark.parametrize("similarity", ["correlation", "overlap", "l2", "distance"])
@@ -134,24 +117,31 @@ def test_empty_images_are_like_nothing():
     assert bool(image_similarity(constant, full, "overlap").isfinite().all())
 
 
-def test_bad_arguments_are_named():
-    points, normals = cloud(10)
-    with pytest.raises(InputError, match="normals must have shape"):
-        spin_images(points, normals[:5], points, normals, bin_size=0.1)
-    with pytest.raises(InputError, match="scan_normals must have shape"):
-        spin_images(points, normals, points, normals[:5], bin_size=0.1)
-    with pytest.raises(InputError, match="scan_points must be finite"):
-        spin_images(points, normals, points * math.nan, normals, bin_size=0.1)
-    with pytest.raises(InputTypeError, match=r"scan_points is torch\.float32"):
-        spin_images(points, normals, points.float(), normals, bin_size=0.1)
-    for name in ("bin_size", "support_angle"):
-        with pytest.raises(InputError, match=name):
-            spin_images(points, normals, points, normals, **{"bin_size": 0.1, name: 0.0})
-    with pytest.raises(InputError, match="image_size"):
-        spin_images(points, normals, points, normals, bin_size=0.1, image_size=0)
-    with pytest.raises(InputError, match="weights must have shape"):
-        spin_images(points, normals, points, normals, bin_size=0.1, weights=torch.ones(3))
-    with pytest.raises(InputError, match="similarity must be one of"):
-        image_similarity(points, points, "cosine")
-    with pytest.raises(InputError, match="target must have shape"):
-        image_similarity(points, points[:, :2])
+ROW = torch.eye(3, dtype=torch.float64)
+TWO = {"scan_points": ROW, "scan_normals": ROW, "bin_size": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"normals": ROW[:2]}, "InputError", "normals must have shape"),
+        ({"scan_normals": ROW[:2]}, "InputError", "scan_normals must have shape"),
+        ({"scan_points": ROW * math.nan}, "InputError", "scan_points must be finite"),
+        ({"scan_points": ROW.float()}, "InputTypeError", r"scan_points is torch\.float32"),
+        ({"bin_size": 0.0}, "InputError", "bin_size"),
+        ({"support_angle": 0.0}, "InputError", "support_angle"),
+        ({"image_size": 0}, "InputError", "image_size"),
+        ({"weights": torch.ones(2)}, "InputError", "weights must have shape"),
+    ],
+)
+def test_bad_arguments_are_named(change, error, words):
+    given = {"points": ROW, "normals": ROW, **TWO, **change}
+    with pytest.raises(getattr(tr.errors, error), match=words):
+        spin_images(**given)
+
+
+def test_similarities_of_other_names_and_sizes_are_refused():
+    with pytest.raises(tr.errors.InputError, match="similarity must be one of"):
+        image_similarity(ROW, ROW, "cosine")
+    with pytest.raises(tr.errors.InputError, match="target must have shape"):
+        image_similarity(ROW, ROW[:, :2])

@@ -1,14 +1,15 @@
 """Spin images matched per region, and the motions that these agree on."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+import torchreg as tr
 from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.geometry.rigid import se3_exp, transform_points
-from torchreg.registration.paper.config import PaperConfig
 from torchreg.registration.paper.spin_matches import spin_matches
 
 MOTION = se3_exp(torch.tensor([0.05, -0.02, 0.03, 0.1, -0.1, 0.15]))
@@ -19,9 +20,9 @@ def source():
     return walking_figure(2, scanner=DepthScanner(num_points=1500))[0]
 
 
-def matches_of(source, target, regions, count, **settings):
+def matches_of(source, target, regions, count):
     index = torch.arange(0, len(source), 5)
-    config = PaperConfig(max_distance=60.0, **settings)
+    config = replace(tr.RegisterConfig.paper().printed, max_distance=60.0)
     found = spin_matches(
         source, index, target, regions[index], count, config, bin_size=3 * source.spacing,
         generator=torch.Generator().manual_seed(0),

@@ -19,7 +19,7 @@ from torchreg.registration.bones.joint_moments import JointMoments
 from torchreg.registration.bones.joint_prior import joint_weights, with_stiffness
 from torchreg.registration.bones.joints import REGULARIZATION, Joints, find_joints
 from torchreg.registration.bones.labels import CellData, LabelCosts, first_labels, relabel
-from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
+from torchreg.registration.bones.motion_problem import BoneProblem
 from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.bones.motions_and_joints import JointFit, fit_bones_and_joints
 from torchreg.registration.bones.registration_energy import EnergyState
@@ -132,14 +132,9 @@ class ReducedFit:
     def solve_motions(self) -> float:
         """Fit the bones' motions and joints to the correspondences: the T-step, eq. 5; return the mean energy."""
         points, transforms, joints = self.samples.points, self.model.transforms.detach(), self._joints()
-        weights = self.model.weights_at(points).detach()
-        problem = BoneProblem(
-            points=points,
-            binding=Binding.from_weights(weights),
-            correspondences=self.correspondences,
-            bodies=BoneBodies.from_weights(points, weights),
-            joint_weight=self._joint_weight,
-            blend=self.config.blend,
+        weights, blend = self.model.weights_at(points).detach(), self.config.blend
+        problem = BoneProblem.of_weights(
+            points, weights, self.correspondences, joint_weight=self._joint_weight, blend=blend
         )
         fit: BoneFit | JointFit
         if joints is None:

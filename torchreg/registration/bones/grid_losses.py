@@ -18,16 +18,7 @@ class JointEnergy(nn.Module):
     def forward(self, transforms: Tensor, moments: JointMoments, pair_weights: Tensor | None = None) -> Tensor:
         """Return the energy (...) of every pose of the batch, squared units.
 
-        Args:
-            transforms: (..., B, 4, 4).
-            moments: of the P pairs of bones that share weight.
-            pair_weights: (..., P) of the joints, zero for one that does not hold; ones by default.
-
-        Raises:
-            InputError: if a shape does not fit.
-            InputTypeError: if dtypes or devices differ.
-
-        Differentiable: in ``transforms``, ``pair_weights`` and the moments.
+        ``pair_weights``: (..., P) of the joints, zero for one that does not hold; ones by default.
         """
         per_pair = self.per_pair(transforms, moments)
         if pair_weights is None:
@@ -47,8 +38,6 @@ class JointEnergy(nn.Module):
 
 def smoothness_energy(weights: Tensor, edges: Tensor) -> Tensor:
     """Return ``E = sum_{(c, d)} |v_c - v_d|^2`` (...) of weights (..., K, B) over edges (E, 2) between corners.
-
-    Differentiable: in ``weights``.
 
     References: Chang and Zwicker 2009, eq. 6.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -114,6 +114,12 @@ class BoneProblem:
     anchor_weights: float | Tensor = 0.0
     blend: str = "linear"
 
+    @classmethod
+    def of_weights(cls, points: Tensor, weights: Tensor, correspondences: Correspondences, **terms: Any) -> BoneProblem:
+        """Return the problem of bones that have weights (N, B) at the points; the other terms by name."""
+        binding, bodies = Binding.from_weights(weights), BoneBodies.from_weights(points, weights)
+        return cls(points=points, binding=binding, correspondences=correspondences, bodies=bodies, **terms)
+
     def energy(self, transforms: Tensor) -> Tensor:
         """Return E (...) at motions (..., B, 4, 4). Cost: that of `linearize`."""
         return 2 * self.linearize(transforms).cost
@@ -148,8 +154,8 @@ class BoneProblem:
         transforms = self.batched(transforms)
         equations = _NormalEquations(transforms, self.centers(transforms))
         self._add_correspondences(equations)
-        if self._springs is not None:
-            self._add_springs(equations, self._springs if joints is None else self._springs.at(joints))
+        if self._pairwise is not None:
+            self._add_pairwise(equations, self._pairwise if joints is None else self._pairwise.at(joints))
         return equations.linearization()
 
     @cached_property
@@ -190,42 +196,42 @@ class BoneProblem:
         equations.add_blocks(first.mT * second if rows.shape[-2] == 1 else first.mT @ second, binding.block)
 
     @cached_property
-    def _springs(self) -> _Springs | None:
+    def _pairwise(self) -> _PairwiseFactors | None:
         """Joints between bones, then anchors, which follow the B bones as numbers B to 2 B - 1."""
         size, device = self.binding.num_bones, self.points.device
         num_joints = len(self.moments.pairs) if self.joint_weight > 0 else 0
-        springs: list[tuple[Tensor, Tensor, Tensor, float | Tensor]] = []
+        factors: list[tuple[Tensor, Tensor, Tensor, float | Tensor]] = []
         if num_joints:
             moments, pair_weights = self.moments, 1.0 if self.pair_weights is None else self.pair_weights
-            springs.append((moments.pairs, moments.center, moments.spread, self.joint_weight * pair_weights))
+            factors.append((moments.pairs, moments.center, moments.spread, self.joint_weight * pair_weights))
         if self.anchors is not None:
             bones = torch.arange(size, device=device)
             pairs = torch.stack([bones, bones + size], dim=-1)
-            springs.append((pairs, self.bodies.center, self.bodies.spread, self.anchor_weights))
-        if not springs:
+            factors.append((pairs, self.bodies.center, self.bodies.spread, self.anchor_weights))
+        if not factors:
             return None
-        weights = [_per_spring(weight, len(pairs), self.points) for pairs, _, _, weight in springs]
+        weights = [_per_factor(weight, len(pairs), self.points) for pairs, _, _, weight in factors]
         batch = np.broadcast_shapes(*(tuple(weight.shape[:-1]) for weight in weights))
         weight = torch.cat([weight.expand(*batch, weight.shape[-1]) for weight in weights], dim=-1)
-        pairs, centers, spreads = (torch.cat(column) for column in list(zip(*springs, strict=True))[:3])
+        pairs, centers, spreads = (torch.cat(column) for column in list(zip(*factors, strict=True))[:3])
         first, second = pairs.unbind(-1)
         ends = torch.cat([first, second])
         free = ends[: len(first) + num_joints]
         blocks = torch.cat([free * (size + 1), first[:num_joints] * size + second[:num_joints]])
-        frames = _spring_frames(centers, spreads)
-        return _Springs(ends, torch.cat([frames, frames]), weight.sqrt(), blocks, num_joints)
+        frames = _factor_rows(centers, spreads)
+        return _PairwiseFactors(ends, torch.cat([frames, frames]), weight.sqrt(), blocks, num_joints)
 
-    def _add_springs(self, equations: _NormalEquations, springs: _Springs) -> None:
-        count, joints = len(springs.ends) // 2, springs.num_joints
+    def _add_pairwise(self, equations: _NormalEquations, factors: _PairwiseFactors) -> None:
+        count, joints = len(factors.ends) // 2, factors.num_joints
         motions = equations.transforms
         if self.anchors is not None:
             motions = torch.cat([motions, self.anchors.expand(motions.shape)], dim=-3)
-        root = springs.root[..., None, None]
-        images = springs.frames @ motions.index_select(-3, springs.ends)[..., :3, :].mT
+        root = factors.root[..., None, None]
+        images = factors.frames @ motions.index_select(-3, factors.ends)[..., :3, :].mT
         residual = (root * (images[..., :count, :, :] - images[..., count:, :, :])).flatten(-2)
         equations.cost = equations.cost + 0.5 * residual.square().sum((-1, -2))
         # Anchors stay: of the second ends only those of the joints move.
-        free, frames = springs.ends[: count + joints], springs.frames[: count + joints]
+        free, frames = factors.ends[: count + joints], factors.frames[: count + joints]
         roots = torch.cat([root, root[..., :joints, :, :]], dim=-3)
         shares = roots * frames[..., 3:]
         pivots = equations.centers.index_select(-2, free).unsqueeze(-2)
@@ -236,17 +242,17 @@ class BoneProblem:
         residuals = torch.cat([residual, -residual[..., :joints, :]], dim=-2)
         equations.add_gradient((jacobian.mT @ residuals.unsqueeze(-1)).squeeze(-1), free)
         mixed = jacobian[..., :joints, :, :].mT @ jacobian[..., count:, :, :]
-        equations.add_blocks(torch.cat([jacobian.mT @ jacobian, -mixed], dim=-3), springs.blocks)
+        equations.add_blocks(torch.cat([jacobian.mT @ jacobian, -mixed], dim=-3), factors.blocks)
 
 
-class _Springs(NamedTuple):
-    """Squared distances between the images of a body under two motions, one spring each.
+class _PairwiseFactors(NamedTuple):
+    """Squared distances between the images of a body under two motions, one factor each.
 
     Args:
-        ends: (2 S,) first motions of the S springs, joints before anchors, then second motions.
+        ends: (2 S,) first motions of the S factors, joints before anchors, then second motions.
         frames: (2 S, 4, 4) of both ends: homogeneous rows whose squared images under a difference of motions add up to
             the mean over the body.
-        root: (..., S) of the springs' weights.
+        root: (..., S) of the factors' weights.
         blocks: of the Hessian: those of every end that moves, then those of the joints' pairs.
     """
 
@@ -256,20 +262,20 @@ class _Springs(NamedTuple):
     blocks: Tensor
     num_joints: int
 
-    def at(self, joints: Tensor) -> _Springs:
-        """Return the springs with the joints at other centers (P, 3)."""
+    def at(self, joints: Tensor) -> _PairwiseFactors:
+        """Return the factors with the joints at other centers (P, 3)."""
         frames = self.frames.clone()
         frames.unflatten(0, (2, -1))[:, : self.num_joints, 0, :3] = joints
         return self._replace(frames=frames)
 
 
-def _per_spring(weight: float | Tensor, count: int, like: Tensor) -> Tensor:
+def _per_factor(weight: float | Tensor, count: int, like: Tensor) -> Tensor:
     """Return weights (..., count) of one for all or of one for each."""
     weight = torch.as_tensor(weight, dtype=like.dtype, device=like.device)
     return weight.expand(count) if weight.ndim == 0 else weight
 
 
-def _spring_frames(center: Tensor, spread: Tensor) -> Tensor:
+def _factor_rows(center: Tensor, spread: Tensor) -> Tensor:
     """Return (S, 4, 4): the rows (c, 1) and (l_k, 0) with ``sum l_k l_k^T`` the spread."""
     squares, axes = torch.linalg.eigh(spread)
     arms = (axes * squares.clamp_min(0).sqrt().unsqueeze(-2)).mT

@@ -69,20 +69,9 @@ def fit_bones(
     The damping weighs the mean squared displacement of the bones' bodies: chains of bones move together as freely as
     one bone, which a damping of the diagonal would prevent where joints are stiff.
 
-    Args:
-        problem: the energy.
-        transforms: (..., B, 4, 4) to start from.
-        fixed: (B,) bool, bones to hold.
-        max_steps: most linear systems.
-        rtol: relative change of a problem's energy below which a step is its last.
-        atol: a problem is done when its energy is below the square of this length.
-        damping: (...) to start with; 1 for starts far off.
-        retract: motions and twists (..., B, 6) about the bodies' centers to motions; `turn_about` by default.
-
-    Returns:
-        a `BoneFit`.
-
-    Differentiable: no.
+    ``rtol``: relative change of a problem's energy below which a step is its last. ``atol``: a problem is done when its
+    energy is below the square of this length. ``retract``: motions and twists (..., B, 6) about the bodies' centers to
+    motions; `turn_about` by default.
 
     References: Chang and Zwicker 2009, eq. 5; Marquardt 1963.
     """

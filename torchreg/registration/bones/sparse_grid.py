@@ -86,21 +86,8 @@ class SparseGrid:
     def from_points(cls, points: Any, resolution: int = 50, *, frame: str = "principal") -> SparseGrid:
         """Return the grid of the cells that hold points: ``resolution`` cubes along the longest side of their box.
 
-        Args:
-            points: (N, 3), at two different places or more, in any unit.
-            resolution: cells along the longest side, 1 to `MAX_RESOLUTION`.
-            frame: "principal": the sides follow the principal axes of the points, so that turning the points turns the
-                grid and changes nothing else; "world": the coordinate axes.
-
-        Returns:
-            the grid, in the dtype and on the device of the points.
-
-        Raises:
-            InputError: if a number is not finite, all points are one, or the resolution is out of range.
-
-        Differentiable: no.
-
-        Cost: 10 ms for 20,000 points at resolution 50, 0.1 s for 100,000 at 100.
+        ``frame``: "principal": the sides follow the principal axes of the points, so that turning the points turns the
+        grid and changes nothing else; "world": the coordinate axes.
         """
         points = as_float_tensor(points, "points").detach()
         check_points(points, "points", batch=False)
@@ -193,8 +180,6 @@ class SparseGrid:
         """Return values (K, B) at the corners, each the mean over the cells around it, of values (C, B) of the cells.
 
         Labels as rows of zeros and a one become the binary weights of eq. 12, averaged where labels meet.
-
-        Differentiable: in ``values``.
         """
         index = self.cell_corners.flatten()
         total = values.new_zeros(self.num_corners, values.shape[-1])

@@ -38,16 +38,7 @@ def step_record(
     matches: Sequence[CompatibleMatches],
     at: tuple[str, int, int],
 ) -> RegisterRecord:
-    """Return the record of a step.
-
-    Args:
-        state: of the fit after it.
-        weights: of the terms of the energy, by name.
-        cut_edges: see `cut_edges`.
-        joint: mean squared distance of what bones share.
-        matches: one per frame.
-        at: stage, number of the step and of the steps of the stage.
-    """
+    """Return the record of a step."""
     pairs = state.correspondences
     residuals = pairs.weights * pairs.squared_residuals(state.moved)
     stage, step, num_steps = at

@@ -160,10 +160,7 @@ def _homogeneous(row: Tensor, column: Tensor, value: Tensor, kept: Tensor) -> _R
 def _weighted_residuals(offsets: Tensor, correspondences: Correspondences, scale: float) -> Tensor:
     """Return residuals (..., N, B, m) of which the squared sums are `squared_residuals`, weighted.
 
-    Args:
-        offsets: (..., N, B, 3) of the points, moved by each bone, from their targets.
-        correspondences: (..., N).
-        scale: of the mean squared residual.
+    ``offsets``: (..., N, B, 3) of the points, moved by each bone, from their targets.
     """
     share, normals = correspondences.point_to_point, correspondences.normals
     weights = correspondences.weights.double().expand(offsets.shape[:-2])

@@ -67,25 +67,10 @@ def align_scans(
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
 
-    Args:
-        source: the scan to be moved, N points.
-        target: the scan to be reached, M points, in the same frame and unit.
-        config: see `ScanAlignConfig`.
-        generator: source of randomness; None draws the same numbers at every call.
-        on_step: called with a `ScanAlignRecord` for each step, by the calling thread; when a hypothesis that another
-            thread follows is done, for all of its steps.
-        expected: where the source's points (N, 3) are expected, such as by their velocity, and how surely.
-
-    Returns:
-        a `ScanAlignment`.
-
-    Raises:
-        InputError: if ``expected`` is not finite, its std is negative, or its shape does not fit.
-
-    Differentiable: no.
-
-    Cost: 0.7 to 1.5 s for scans of 8,000 points on one core; three quarters where torch may use two threads, which
-    then follow two hypotheses side by side: the result is the same to the bit.
+    ``target``: the scan to be reached, M points, in the same frame and unit. ``generator``: source of randomness; None
+    draws the same numbers at every call. ``on_step``: called with a `ScanAlignRecord` for each step, by the calling
+    thread; when a hypothesis that another thread follows is done, for all of its steps. ``expected``: where the
+    source's points (N, 3) are expected, such as by their velocity, and how surely.
 
     References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
     Myronenko and Song 2010 for the EM with outliers.
@@ -141,13 +126,13 @@ def align_problem(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]
 
 
 def evidence_against(problem: ScanAlignProblem, best: Candidate) -> ScanEvidence:
-    """Return what speaks against a candidate."""
+    """Return the evidence vector of a candidate."""
     return scan_evidence(problem, best.transforms, best.hypothesis.smoothness)
 
 
 def _candidates(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     """Return the candidates before any are fused."""
-    near, matched = _both_told(on_step, partial(_near, problem), partial(_by_matches, problem))
+    near, matched = _run_both_reporting(on_step, partial(_near, problem), partial(_by_matches, problem))
     return [*near, matched]
 
 
@@ -156,8 +141,8 @@ def _near(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     rest = problem.graph.rest()
     found = [_compared(problem, rest, Reporter("rest", problem.unit.scale, on_step))]
     if problem.expected is not None:
-        there = GraphMatches.of_places(problem.expected.places)
-        ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
+        expected = GraphMatches.of_places(problem.expected.places)
+        ahead = fit_graph(problem.graph, rest, expected, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
         found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step)))
     return found
 
@@ -168,7 +153,7 @@ def _by_matches(problem: ScanAlignProblem, on_step: OnStep) -> Candidate:
     return _compared(problem, fit_coarsely(problem, reporter), reporter)
 
 
-def _both_told(
+def _run_both_reporting(
     on_step: OnStep, one: Callable[[OnStep], _One], other: Callable[[OnStep], _Other]
 ) -> tuple[_One, _Other]:
     """Return what two calls return, made side by side; the thread that called the library tells of their steps."""

@@ -45,9 +45,6 @@ class BlendSums:
         weights: (R, K) by how much; of any sign, zero for none.
         num_nodes: J.
 
-    Raises:
-        InputError: if a shape does not fit or a node does not exist.
-
     References: Sumner, Schmid and Pauly 2007, section 4.
     """
 
@@ -81,21 +78,17 @@ class BlendSums:
         return (rows @ self._ends.unsqueeze(-1)).squeeze(-1)
 
     def normal_equations(
-        self, transforms: Tensor, middles: Tensor, metrics: Tensor, pulls: Tensor
+        self, transforms: Tensor, middles: Tensor, metrics: Tensor, weighted_residuals: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the gradient (J, 6) and the Hessian (6 J, 6 J), of which the lower triangle alone is filled.
 
         Convention: twists are (translation, rotation), about the middles; see `turn_about`.
-
-        Args:
-            transforms: (J, 4, 4).
-            middles: (J, 3) about which nodes turn.
-            metrics: (R, 6) upper triangles of P_i.
-            pulls: (R, 3) P_i d_i.
         """
         arms = transforms.clone()
         arms[:, :3, 3] -= middles
-        slopes = _applied(self._gather, (self._ends.unsqueeze(2) * pulls.unsqueeze(1)).flatten(1)).unflatten(1, (4, 3))
+        slopes = _applied(
+            self._gather, (self._ends.unsqueeze(2) * weighted_residuals.unsqueeze(1)).flatten(1)
+        ).unflatten(1, (4, 3))
         turn = arms[:, :3] @ slopes
         moments = torch.stack([turn[:, one, two] - turn[:, two, one] for one, two in ((1, 2), (2, 0), (0, 1))], dim=1)
         return torch.cat((slopes[:, 3], moments), dim=1), self._hessian(arms, metrics)
@@ -111,10 +104,10 @@ class BlendSums:
         return blocks.view(size, size, 6, 6).transpose(1, 2).reshape(6 * size, 6 * size)
 
 
-def upper_triangles(scales: Tensor, normals: Tensor | None, slides: Tensor | float) -> Tensor:
-    """Upper triangles (n, 6) of ``scale (n n^T + slide I)``; without normals of ``scale slide I``."""
+def upper_triangles(scales: Tensor, normals: Tensor | None, tangential_weights: Tensor | float) -> Tensor:
+    """Upper triangles (n, 6) of ``scale (n n^T + t I)`` with tangential weights t; without normals ``scale t I``."""
     diagonal = (_UPPER_SIX[0] == _UPPER_SIX[1]).to(scales)
-    triangle = torch.as_tensor(slides).to(scales).reshape(-1, 1) * diagonal
+    triangle = torch.as_tensor(tangential_weights).to(scales).reshape(-1, 1) * diagonal
     if normals is not None:
         triangle = triangle + normals[:, _UPPER_SIX[0]] * normals[:, _UPPER_SIX[1]]
     return scales.unsqueeze(1) * triangle

@@ -43,14 +43,7 @@ def fit_coarsely(problem: ScanAlignProblem, reporter: Reporter) -> Tensor:
 
 
 def rigid_start(prior: MatchPrior, source: Tensor, target: Tensor, width: float) -> Tensor:
-    """Return the motion (4, 4) of all of a source that suits most of the matches of the matcher.
-
-    Args:
-        prior: of the matches.
-        source: (S, 3) samples, the first of which are tokens.
-        target: (T, 3) the same of the target.
-        width: matches off by more than this count ever less.
-    """
+    """Return the motion (4, 4) of all of a source that suits most of the matches of the matcher."""
     mass = prior.by_source.sum(1)
     targets = prior.by_source @ target[: prior.by_source.shape[1]]
     targets = targets / mass.clamp_min(torch.finfo(mass.dtype).tiny).unsqueeze(1)

@@ -43,16 +43,13 @@ class ScanAlignConfig:
             apart.
         refine: the EM that ends every hypothesis: sigma from how far a start may be off.
         edge_scale: nodes that disagree by more than this hold each other less, length.
-        normal_weight: exponent lost by normals at right angles.
+        normal_weight: concentration of the normal kernel: exponent lost by normals at right angles.
         tangential_weight: how much residuals along the surface count, squared, at sigmas far below what tokens are
             apart: cloth and round limbs have far to go.
         outliers: expected outliers, as a share of what a sample in the middle of its matches gets.
         doubt: support of a match that the matcher calls impossible, beside one of a sure match.
         cap: distances from the target count up to this in the choice among the hypotheses, length.
         smoothness: what it costs there that neighboring nodes disagree by one size in the mean.
-
-    Raises:
-        InputError: if a value is out of range.
     """
 
     num_samples: int = 1200

@@ -30,9 +30,6 @@ class DeformationGraph(nn.Module):
         edges: (E, 2) nodes that are neighbors.
         edge_weights: (E,) how much the neighbors hold each other.
 
-    Raises:
-        InputError: if a shape does not fit or a number is not finite.
-
     References: Sumner, Schmid and Pauly 2007, section 3.
     """
 
@@ -100,14 +97,7 @@ class DeformationGraph(nn.Module):
         return torch.linalg.matrix_power(near, num_edges) > 0
 
     def forward(self, transforms: Tensor, which: Tensor | slice = slice(None)) -> Tensor:
-        """Return moved samples (..., n, 3).
-
-        Args:
-            transforms: (..., J, 4, 4) motions of the nodes, world to world.
-            which: (n,) indices of samples; all by default.
-
-        Differentiable: in ``transforms``.
-        """
+        """Return moved samples (..., n, 3)."""
         return blend_linear(self.points[which], self.dense_weights[which], transforms)
 
     def move_with_normals(self, transforms: Tensor, which: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
@@ -121,19 +111,13 @@ class DeformationGraph(nn.Module):
         """Return how far neighbors disagree about where each of the two nodes goes, (..., E, 2, 3).
 
         The regularizer of the graph is the weighted sum of their squares.
-
-        Differentiable: in ``transforms``.
         """
         one, other = (transforms[..., ends, :, :] for ends in self.edges.unbind(-1))
         both = self.centers[self.edges]
         return transform_points(one, both) - transform_points(other, both)
 
     def smoothness(self, transforms: Tensor) -> Tensor:
-        """Return the weighted mean over edges of both gaps' lengths, (...), in the unit of the points.
-
-        Args:
-            transforms: (..., J, 4, 4).
-        """
+        """Return the weighted mean over edges of both gaps' lengths, (...), in the unit of the points."""
         if len(self.edges) == 0:
             return transforms.new_zeros(transforms.shape[:-3])
         gap = self.edge_gaps(transforms).norm(dim=-1).sum(-1)

@@ -46,7 +46,7 @@ class GraphMatches:
 
 @dataclass(frozen=True)
 class GraphFit:
-    """Where steps have led.
+    """The result of Gauss-Newton steps.
 
     Args:
         transforms: (J, 4, 4).
@@ -76,20 +76,8 @@ def fit_graph(
     the edge's two gaps: parts stay rigid, and what they do not share, joints take up. No step shifts a node by more
     than the diagonal of the samples or the largest residual.
 
-    Args:
-        graph: what is moved, float64 on the CPU.
-        transforms: (J, 4, 4) to start from.
-        matches: see `GraphMatches`.
-        stiffness: see above.
-        num_steps: linear systems, at least one, none of them tested: the caller finds new matches before long.
-        edge_scale: see above, in the unit of the points; None for edges that are never let go.
-
-    Returns:
-        a `GraphFit`.
-
-    Differentiable: no.
-
-    Cost: 2 ms a step for 1,200 samples on 4 of 60 nodes each, on one core, half of it for the linear system.
+    ``num_steps``: linear systems, at least one, none of them tested: the caller finds new matches before long.
+    ``edge_scale``: see above, in the unit of the points; None for edges that are never let go.
 
     References: Sumner, Schmid and Pauly 2007, section 4; Chang and Zwicker 2009, eq. 5, for the steps on twists.
     """
@@ -101,10 +89,12 @@ def fit_graph(
     size = float((graph.points.amax(0) - graph.points.amin(0)).norm())
     for _ in range(num_steps):
         middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
-        metrics, pulls, residual, smoothness, farthest = _costs(
+        metrics, weighted_residuals, residual, smoothness, farthest = _costs(
             graph, graph.sums.places(transforms), matches, stiffness, edge_scale
         )
-        twists = _solved(*graph.sums.normal_equations(transforms, middles, metrics, pulls), max(size, farthest))
+        twists = _solved(
+            *graph.sums.normal_equations(transforms, middles, metrics, weighted_residuals), max(size, farthest)
+        )
         transforms = turn_about(transforms, twists, middles)
     return GraphFit(transforms, residual, smoothness)
 
@@ -112,15 +102,18 @@ def fit_graph(
 def _costs(
     graph: DeformationGraph, places: Tensor, matches: GraphMatches, stiffness: float, edge_scale: float | None
 ) -> tuple[Tensor, Tensor, float, float, float]:
-    """Return metrics (S + 2 E, 6), pulls (S + 2 E, 3), costs of samples and of gaps, and the largest residual."""
+    """Return metrics (S + 2 E, 6), weighted residuals (S + 2 E, 3), costs of samples and gaps, the largest residual."""
     count, shares = len(graph.points), matches.weights / max(1, len(matches.weights))
-    metrics, pulls = places.new_zeros(len(places), 6), places.new_zeros(len(places), 3)
-    miss = places[:count][matches.which] - matches.targets
-    pull = torch.as_tensor(matches.tangential_weight).to(miss).reshape(-1, 1) * miss
+    metrics, weighted_residuals = places.new_zeros(len(places), 6), places.new_zeros(len(places), 3)
+    residual = places[:count][matches.which] - matches.targets
+    weighted_residual = torch.as_tensor(matches.tangential_weight).to(residual).reshape(-1, 1) * residual
     if matches.normals is not None:
-        pull = pull + matches.normals * (matches.normals * miss).sum(-1, keepdim=True)
-    pull = shares.unsqueeze(1) * pull
-    for sums, part in ((metrics, upper_triangles(shares, matches.normals, matches.tangential_weight)), (pulls, pull)):
+        weighted_residual = weighted_residual + matches.normals * (matches.normals * residual).sum(-1, keepdim=True)
+    weighted_residual = shares.unsqueeze(1) * weighted_residual
+    for sums, part in (
+        (metrics, upper_triangles(shares, matches.normals, matches.tangential_weight)),
+        (weighted_residuals, weighted_residual),
+    ):
         if isinstance(matches.which, slice):
             sums[:count][matches.which] = part
         else:
@@ -132,9 +125,15 @@ def _costs(
     )
     held = (stiffness / graph.num_nodes * weights).repeat_interleave(2)
     metrics[count:] = upper_triangles(held, None, 1.0)
-    pulls[count:] = held.unsqueeze(1) * places[count:]
-    farthest = float(miss.norm(dim=-1).max()) if len(miss) else 0.0
-    return metrics, pulls, float((miss * pull).sum()), float((weights * apart).sum()) / graph.num_nodes, farthest
+    weighted_residuals[count:] = held.unsqueeze(1) * places[count:]
+    farthest = float(residual.norm(dim=-1).max()) if len(residual) else 0.0
+    return (
+        metrics,
+        weighted_residuals,
+        float((residual * weighted_residual).sum()),
+        float((weights * apart).sum()) / graph.num_nodes,
+        farthest,
+    )
 
 
 def _solved(gradient: Tensor, matrix: Tensor, farthest: float) -> Tensor:

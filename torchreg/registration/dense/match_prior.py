@@ -37,10 +37,7 @@ class MatchPrior:
     def of_logits(cls, logits: Tensor, source: Tensor, target: Tensor) -> MatchPrior:
         """Return the prior of a matcher's logits.
 
-        Args:
-            logits: (A + 1, B + 1), see `ScanMatcher`.
-            source: (S, 3) samples, the first A of which are tokens; of fewer samples tokens repeat some.
-            target: (T, 3).
+        ``source``: (S, 3) samples, the first A of which are tokens; of fewer samples tokens repeat some.
         """
         by_source, by_target = logits[:-1].softmax(1)[:, :-1], logits[:, :-1].softmax(0)[:-1]
         rows, columns = (min(size, len(points)) for size, points in zip(by_source.shape, (source, target), strict=True))
@@ -49,10 +46,7 @@ class MatchPrior:
 
     @classmethod
     def of_samples(cls, source: OrientedSamples, target: OrientedSamples, count: int) -> MatchPrior:
-        """Return what the matcher of torchreg says of samples, the first ``count`` of the source alone.
-
-        Cost: 0.2 CPU seconds.
-        """
+        """Return what the matcher of torchreg says of samples, the first ``count`` of the source alone."""
         tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (source, target))
         logits = _matcher()(*tokens)[0].to(source.points)
         return cls.of_logits(logits, source.points[:count], target.points)
@@ -87,9 +81,7 @@ class MatchPrior:
     def logarithm(self, index: Tensor, doubt: float) -> Tensor:
         """Return the logarithm (n, K) of how far matches are supported: zero for a sure one.
 
-        Args:
-            index: (n, K) samples of the target that each of the first samples of the source may match.
-            doubt: support of what the matcher calls impossible.
+        ``index``: (n, K) samples of the target that each of the first samples of the source may match.
         """
         chances, weight, about = self._offers
         rows = torch.arange(len(index), device=index.device)[:, None, None]

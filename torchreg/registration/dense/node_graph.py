@@ -51,18 +51,7 @@ def build_node_graph(graph: Graph, start: int, num_nodes: int, num_nearest: int 
     A sample at distances ``d_1 <= d_2 <= ...`` from the nodes follows the first K with weights in proportion to
     ``(1 - d_k / d_{K+1})^2``.
 
-    Args:
-        graph: of the samples; every sample should be reached from every other one.
-        start: sample that is the first node.
-        num_nodes: J; fewer if there are not as many samples.
-        num_nearest: K; fewer if there are not more nodes.
-
-    Raises:
-        InputError: if ``start`` is no sample.
-
-    Differentiable: no.
-
-    Cost: one run of Dijkstra's algorithm per node, over what is nearer to it than nodes are apart.
+    ``graph``: of the samples; every sample should be reached from every other one.
 
     References: Sumner, Schmid and Pauly 2007, section 3.
     """
@@ -130,17 +119,8 @@ def spread_weights(
 ) -> Tensor:
     """Return weights (N, J) of points from those (S, J) of the three samples nearest in place and normal.
 
-    Args:
-        points: (N, 3).
-        normals: (N, 3) unit vectors.
-        samples: (S, 3).
-        sample_normals: (S, 3).
-        weights: (S, J), rows sum to one.
-        normal_scale: what opposite normals count as, in the unit of the points: it keeps the front of a thin limb from
-            following the back of another.
-
-    Returns:
-        (N, J), rows sum to one.
+    ``normal_scale``: what opposite normals count as, in the unit of the points: it keeps the front of a thin limb from
+    following the back of another.
     """
     points = as_float_tensor(points, "points")
     check_points(points, "points", batch=False)

@@ -18,10 +18,6 @@ class OrientedSamples:
         points: (S, 3), any unit.
         normals: (S, 3) unit vectors.
         boundary: (S,) bool, where the scan ends.
-
-    Raises:
-        InputError: if a shape does not fit.
-        InputTypeError: if dtypes or devices differ.
     """
 
     points: Tensor

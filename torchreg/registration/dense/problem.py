@@ -72,39 +72,34 @@ def describe(
     generator: torch.Generator | None = None,
     expected: ExpectedPlaces | None = None,
 ) -> ScanAlignProblem:
-    """Return the problem of aligning two scans.
-
-    Args:
-        source: the scan to be moved.
-        target: the scan to be reached.
-        config: see `ScanAlignConfig`.
-        generator: source of the samples' randomness.
-        expected: where the source's points are expected.
-
-    Cost: 0.3 s for scans of 8,000 points.
-    """
-    here, there = (scan.uniform_subsample(2 * config.num_samples, generator=generator) for scan in (source, target))
-    here, there = here[even_order(source.points[here])], there[even_order(target.points[there])]
-    unit = Normalization.from_points(source.points[here])
-    one, other = (
+    """Return the problem of aligning two scans."""
+    source_index, target_index = (
+        scan.uniform_subsample(2 * config.num_samples, generator=generator) for scan in (source, target)
+    )
+    source_index, target_index = (
+        source_index[even_order(source.points[source_index])],
+        target_index[even_order(target.points[target_index])],
+    )
+    unit = Normalization.from_points(source.points[source_index])
+    source_samples, target_samples = (
         OrientedSamples(
             unit.normalize(scan.points[which]), scan.normals[which].detach().cpu().double(), scan.boundary[which].cpu()
         )
-        for scan, which in ((source, here), (target, there))
+        for scan, which in ((source, source_index), (target, target_index))
     )
-    samples = here[: config.num_samples].cpu()
+    samples = source_index[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
     normals = source.normals.detach().cpu().double()
-    ways = sample_graph(unit.normalize(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
-    nodes = build_node_graph(ways, 0, config.num_nodes)
-    graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
-    ahead = None
+    geodesics = sample_graph(unit.normalize(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
+    nodes = build_node_graph(geodesics, 0, config.num_nodes)
+    graph = DeformationGraph(source_samples.points[: len(samples)], source_samples.normals[: len(samples)], nodes)
+    at_samples = None
     if expected is not None:
         # The last sigma is as near as samples can be told apart.
         std = max(expected.std / unit.scale, config.refine.sigma[1])
-        ahead = ExpectedPlaces(unit.normalize(expected.places)[samples], std)
+        at_samples = ExpectedPlaces(unit.normalize(expected.places)[samples], std)
     return ScanAlignProblem(
-        graph=graph, source=one, target=other, config=config,
-        prior=MatchPrior.of_samples(one, other, len(samples)),
-        samples=samples, nodes=samples[nodes.nodes], unit=unit, expected=ahead,
+        graph=graph, source=source_samples, target=target_samples, config=config,
+        prior=MatchPrior.of_samples(source_samples, target_samples, len(samples)),
+        samples=samples, nodes=samples[nodes.nodes], unit=unit, expected=at_samples,
     )  # fmt: skip

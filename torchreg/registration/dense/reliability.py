@@ -1,4 +1,4 @@
-"""How far an alignment of two scans can be trusted: what speaks against it, and a learnt probability."""
+"""How far an alignment of two scans can be trusted: evidence against it, and a learnt probability."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchreg.registration.dense.stages import mismatch, uncovered
 
 @dataclass(frozen=True)
 class ScanEvidence:
-    """What speaks against an alignment.
+    """Evidence against an alignment.
 
     Args:
         forward: mean cost of moved samples that the matcher calls visible, see `mismatch`.
@@ -67,13 +67,7 @@ def confidence_onward(before: float, confidence: float) -> float:
 
 
 def scan_evidence(problem: ScanAlignProblem, transforms: Tensor, smoothness: float) -> ScanEvidence:
-    """Return the evidence against motions (J, 4, 4) of the nodes.
-
-    Args:
-        problem: the scans.
-        transforms: the motions.
-        smoothness: of the graph, see `Hypothesis`.
-    """
+    """Return the evidence against motions (J, 4, 4) of the nodes."""
     moved, prior = problem.moved(transforms), problem.prior
     cost, index = mismatch(problem, moved)
     support = prior.logarithm(index[:, None], problem.config.doubt)[:, 0]

@@ -61,11 +61,7 @@ class ScanTokens:
     def from_scan(cls, scan: RangeScan, generator: torch.Generator | None = None) -> Self:
         """Return one scan's tokens, float32 on the CPU, B = 1.
 
-        Args:
-            scan: at least three points.
-            generator: draws the points and neighbors; None draws points evenly spread, the same at every call.
-
-        Cost: 0.05 s.
+        ``generator``: draws the points and neighbors; None draws points evenly spread, the same at every call.
         """
         if generator is None:
             index = scan.uniform_subsample(min(SIZES.num_points, len(scan))).cpu()
@@ -86,12 +82,8 @@ class ScanTokens:
     ) -> Self:
         """Return the tokens of samples of one scan: the first of them, B = 1.
 
-        Args:
-            points: (S, 3) samples, every first few of which cover the scan evenly, see `even_order`.
-            normals: (S, 3) unit vectors.
-            boundary: (S,) bool.
-            index: (S,) points of the scan; the samples' own numbers by default.
-            generator: draws the neighbors; None draws the same at every call.
+        ``points``: (S, 3) samples, every first few of which cover the scan evenly, see `even_order`. ``index``: (S,)
+        points of the scan; the samples' own numbers by default.
         """
         count = min(SIZES.num_points, len(points))
         index = torch.arange(count) if index is None else index[:count]

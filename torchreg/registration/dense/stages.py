@@ -53,13 +53,7 @@ class Reporter:
 
 
 def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Tensor:
-    """Return motions refined by EM: sigma shrinks, and the graph softens.
-
-    Args:
-        problem: the scans.
-        transforms: (J, 4, 4) to start from.
-        reporter: takes a record of each step.
-    """
+    """Return motions refined by EM: sigma shrinks, and the graph softens."""
     config, plan = problem.config, problem.config.refine
     for step in range(plan.num_steps):
         share = step / max(plan.num_steps - 1, 1)

@@ -15,7 +15,7 @@ from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.grid_losses import JointEnergy
 from torchreg.registration.bones.joint_moments import NEGLIGIBLE, JointMoments
 from torchreg.registration.bones.labels import CellData, LabelCosts, relabel
-from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
+from torchreg.registration.bones.motion_problem import BoneProblem
 from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.registration_energy import EnergyState
 from torchreg.registration.bones.step_record import cut_edges, reported_weights, step_record
@@ -126,11 +126,10 @@ class PaperFit:
         """Fit the bones' motions to the correspondences while the joint integrals hold them together: eqs. 4 and 5."""
         weights = self.model.weights_at(self._samples).detach()
         moments = self.model.joint_moments()
-        problem = BoneProblem(
-            points=self._samples,
-            binding=Binding.from_weights(weights),
-            correspondences=self.correspondences,
-            bodies=BoneBodies.from_weights(self._samples, weights),
+        problem = BoneProblem.of_weights(
+            self._samples,
+            weights,
+            self.correspondences,
             moments=moments,
             joint_weight=self._stiffness,
             pair_weights=self._shared_cells(moments),

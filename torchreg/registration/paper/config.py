@@ -26,9 +26,6 @@ class PaperConfig:
         ransac_trials: samples per region.
         reuse_error: distance below which a region is not split for unused labels, in sampling distances.
 
-    Raises:
-        InputError: if a value is out of range.
-
     References: Chang and Zwicker 2009, sections 4.2, 4.3 and 5, table 1.
     """
 

@@ -42,13 +42,7 @@ def reuse_labels(
 ) -> Tensor:
     """Return labels (C,) in which unused labels take over random halves of the regions with the largest errors.
 
-    Args:
-        data: the grid and its samples.
-        squares: (n,) squared residuals of the samples.
-        labels: (C,) from 0 without gaps.
-        num_bones: most labels.
-        least_error: root mean squared residual of a region below which it stays whole.
-        generator: draws the halves.
+    ``least_error``: root mean squared residual of a region below which it stays whole.
 
     References: Chang and Zwicker 2009, section 4.2, "Reusing Labels".
     """

@@ -48,16 +48,6 @@ def spin_matches(
 ) -> RegionMatches:
     """Return the target whose spin image is most alike for source points, where their region moves rigidly with it.
 
-    Args:
-        source: the scan to be moved.
-        index: (n,) of its points that are matched.
-        target: the scan to be reached.
-        regions: (n,) region of each matched point.
-        num_regions: B.
-        config: see `PaperConfig`.
-        bin_size: the spacing of the grid.
-        generator: draws the samples of RANSAC.
-
     References: Chang and Zwicker 2009, section 4.3; Johnson 1997 for the similarity; Fischler and Bolles 1981.
     """
     found, reached = _most_alike(source, index, target, config, bin_size)

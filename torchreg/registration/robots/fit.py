@@ -77,15 +77,7 @@ class Mechanism:
 def fitted(
     surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
 ) -> Mechanism:
-    """Return the mechanism after a Gauss-Newton step of point-to-plane residuals at each of some robust scales.
-
-    Args:
-        surfaces: the data.
-        mechanism: to start from.
-        label: (n,) link of each sample.
-        scales: of the kernels, length.
-        axes: whether the joints' axes move too.
-    """
+    """Return the mechanism after a Gauss-Newton step of point-to-plane residuals at each of some robust scales."""
     for scale in scales:
         mechanism = _step(surfaces, mechanism, label, scale, axes)
     return mechanism

@@ -63,15 +63,7 @@ class Relative:
 
 
 def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Noise, size: float) -> Relative:
-    """Return the motions of the second link seen from the first.
-
-    Args:
-        motions: (T, K, 4, 4) of all links.
-        blocks: their normal equations, at least squares.
-        pair: first and second link.
-        noise: of residuals.
-        size: of the thing.
-    """
+    """Return the motions of the second link seen from the first."""
     unit, (first, second) = size / 2, pair
     variance = noise.sigma**2 * noise.repeats
     covariance = torch.zeros(len(motions), 6, 6, dtype=torch.float64)

@@ -33,13 +33,6 @@ def labeled(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, fr
     a border between neighbors costs what its rarity tells (`border_cost`); a label that is used costs its parameters,
     half the logarithm of the number of residuals each. Samples that err together count once.
 
-    Args:
-        surfaces: the data.
-        motions: proposals.
-        label: to start from.
-        noise: of residuals.
-        free: parameters of a label.
-
     References: Isack and Boykov 2012 (PEARL); Delong et al. 2012; Schwarz 1978 for the cost of parameters.
     """
     squares = surfaces.squares(motions, NUMBERS.cut * noise.sigma) / noise.sigma**2
@@ -67,14 +60,7 @@ def without_gaps(motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor, *, split: bool) -> tuple[Tensor, Tensor, Noise]:
-    """Return motions (T, K, 4, 4) and labels (n,) of links, and the noise: proposals, labels and motions in turn.
-
-    Args:
-        surfaces: the data.
-        motions: (T, K, 4, 4) of the parts to start from.
-        label: (n,) part of each sample.
-        split: whether pieces of parts propose motions too.
-    """
+    """Return motions (T, K, 4, 4) and labels (n,) of links, and the noise: proposals, labels and motions in turn."""
     splits = LINKS.splits if split else 0
     free = 6.0 * len(surfaces.targets)
     for number in range(LINKS.rounds):

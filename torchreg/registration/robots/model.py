@@ -96,13 +96,7 @@ def find_robot(
     motions; those that hold together are one. The joints of most evidence make a tree, whose axes and values are fitted
     to all scans together; links and joints are then looked for once more from there.
 
-    Args:
-        points: (N, 3) of the reference.
-        normals: (N, 3) of them.
-        deformed: (T, N, 3) its points registered to every scan.
-        part: (N,) labels of bones, at least as many as links that registration tells apart.
-        scans: T of them; where registration took the points, by default.
-        reference: number of the reference among them.
+    ``part``: (N,) labels of bones, at least as many as links that registration tells apart.
 
     References: Isack and Boykov 2012 for the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most
     evidence.
@@ -164,11 +158,7 @@ def assembled(
 
     The root is the link that moves least: that of an arm stands still.
 
-    Args:
-        surfaces: the data.
-        motions: (T, K, 4, 4) of links that all touch another, if there are two.
-        label: (n,).
-        joints: of pairs of links, the lower number first.
+    ``motions``: (T, K, 4, 4) of links that all touch another, if there are two.
     """
     count, frames = motions.shape[1], len(motions)
     pairs = torch.tensor(list(joints), dtype=torch.long).reshape(-1, 2)
@@ -264,16 +254,6 @@ def write_robot(
 
     That mesh is the link's triangles in the reference; without triangles, a closed surface about the points that all
     scans show of the link.
-
-    Args:
-        path: of the .urdf file.
-        found: the robot.
-        points: (N, 3) of the reference.
-        faces: (F, 3) of it, or None.
-        scans: all scans, which a reference without triangles needs.
-
-    Raises:
-        InputError: if there are neither triangles nor scans.
     """
     points = points.detach().cpu().double()
     if faces is not None:

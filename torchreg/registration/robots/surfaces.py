@@ -159,13 +159,7 @@ class Surfaces:
         return max(1.0, float(sums.square().sum() / (variance * count.sum()).clamp_min(1e-300)))
 
     def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
-        """Return the normal equations of robust squared residuals at the motions (T, K, 4, 4) of parts (n,).
-
-        Args:
-            motions: of the parts.
-            label: part of each sample.
-            scale: of the robust kernel, length.
-        """
+        """Return the normal equations of robust squared residuals at the motions (T, K, 4, 4) of parts (n,)."""
         size = motions.shape[1]
         member = torch.nn.functional.one_hot(label, size).to(self.samples)
         middle = (member.mT @ self.samples) / member.sum(0).clamp_min(1).unsqueeze(-1)
