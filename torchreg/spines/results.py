@@ -17,7 +17,15 @@ from torchreg.spines.spine import Spine
 
 @dataclass(frozen=True)
 class SpineRecord:
-    """One frame that was skeletonized, for ``on_step``, in any order; zero seconds if kept from an earlier call."""
+    """One frame that was skeletonized, as given to ``on_step``.
+
+    Args:
+        frame: its number; frames may be done in any order.
+        num_frames: of the sequence.
+        num_tips: of its own skeleton.
+        topology: of its own skeleton, see `Skeleton.topology`.
+        seconds: that it took; zero if it was kept from an earlier call.
+    """
 
     frame: int
     num_frames: int

@@ -51,7 +51,13 @@ _SETTINGS = FrameSettings()
 
 
 class FrameFitter:
-    """Fits a shape to frames, from predictions or from given poses; model points are sampled by default."""
+    """Fits a shape to frames, from predictions or from given poses.
+
+    Args:
+        shape: the articulated shape, in metres.
+        config: see `TrackConfig`.
+        skin: the model points; sampled by default.
+    """
 
     def __init__(self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None) -> None:
         self.shape, self.config = shape, config
