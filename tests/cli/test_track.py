@@ -8,6 +8,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import torchreg as tr
@@ -129,6 +130,27 @@ def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command,
     with Image.open(tmp_path / "r.gif") as file:
         assert (file.n_frames, file.info["duration"]) == (FRAMES, 50)
     assert tr.ArticulatedShape.from_gltf(tmp_path / "r.glb").part_names[0] == "palm"
+
+
+def test_far_coordinates_keep_their_digits_and_are_drawn_near_zero(run, sequence, whole, tmp_path):
+    far, start = (
+        torch.tensor([5e5, 4e6, 0.0]).double(),
+        json.loads((sequence / "start.json").read_text(encoding="utf-8")),
+    )
+    save_points(tmp_path / "far.xyz", tr.load_points(sequence / "frames" / "frame_0000.ply").points.double() + far)
+    moved = [value + far[number].item() if number < 3 else value for number, value in enumerate(start)]
+    (tmp_path / "far.json").write_text(json.dumps(moved), encoding="utf-8")
+    command = "track", "hand", tmp_path / "far.xyz", "-o", tmp_path / "r", "--start", tmp_path / "far.json"
+    answer = run(*command, "--movie", "none")
+    assert answer.exit_code == 0, answer.output
+    assert "r.glb holds coordinates from 500000 4" in answer.output
+    found = tr.load(tmp_path / "r.safetensors")
+    torch.testing.assert_close(found.poses[0, :3] - far, whole.poses[0, :3].double(), atol=1e-3, rtol=0)
+    assert np.abs(trimesh.load_scene(tmp_path / "r.glb").bounds).max() < 10
+    assert run("export", tmp_path / "r", "--data", tmp_path / "far.xyz", "-o", tmp_path / "r.gif").exit_code == 0
+    with Image.open(tmp_path / "r.gif") as file:  # data on the shape are blue
+        colors = np.asarray(file.convert("RGB")).reshape(-1, 3).astype(int)
+    assert ((colors[:, 2] > colors[:, 0] + 60) & (colors[:, 2] > 120)).sum() > 20
 
 
 def test_archives_and_lists_of_files_are_sequences_too(run, command, whole, tmp_path):
