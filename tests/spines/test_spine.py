@@ -51,6 +51,12 @@ def test_speed_does_not_jump_at_the_frames(spine):
         torch.testing.assert_close(before, after, atol=1e-4, rtol=1e-4)
 
 
+def test_states_are_saved_and_loaded(spine):
+    loaded = tr.Spine(made_curves(seed=3), GRAPH, times=spine.times)
+    loaded.load_state_dict(spine.state_dict())
+    assert torch.equal(loaded(2.2), spine(2.2))
+
+
 def test_limbs_share_their_nodes_also_after_a_step(spine):
     with torch.no_grad():
         spine.nodes += 0.1 * torch.randn(spine.nodes.shape, generator=torch.Generator().manual_seed(1))
