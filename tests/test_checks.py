@@ -35,6 +35,12 @@ def test_the_kind_of_another_tensor_is_taken_over():
     assert checks.as_float_tensor([1.0], "points", like=like).dtype == torch.float16
 
 
+@pytest.mark.parametrize("value", [0.1, [0.1, 1 / 3]])
+def test_numbers_of_python_keep_their_digits(value):
+    found = checks.as_float_tensor(value, "points", like=torch.zeros(1, dtype=torch.float64))
+    assert found.tolist() == value
+
+
 def test_conversion_keeps_the_graph():
     value = torch.zeros(2, requires_grad=True)
     like = torch.zeros(1, dtype=torch.float64)

@@ -36,10 +36,12 @@ def as_float_tensor(value: Any, name: str, *, like: Tensor | None = None) -> Ten
     Raises:
         InputTypeError: if ``value`` cannot become a tensor of real numbers.
     """
-    value = as_tensor(value, name, "numbers")
+    given, value = value, as_tensor(value, name, "numbers")
     if value.is_complex() or value.dtype == torch.bool:
         raise InputTypeError(f"{name} must hold real numbers, got dtype {value.dtype}")
     if like is not None:
+        if value.is_floating_point() and not hasattr(given, "dtype"):
+            value = torch.as_tensor(given, dtype=torch.float64)  # Python's numbers have that many digits
         return value.to(dtype=like.dtype, device=like.device)
     return value if value.is_floating_point() else value.to(torch.get_default_dtype())
 

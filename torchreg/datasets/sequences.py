@@ -66,12 +66,7 @@ def hand_sequence(
     Returns:
         Clouds, one per frame.
 
-    Raises:
-        InputError: if an argument is out of range or no frame shows the shape.
-
     References: Dewaele et al. 2006, section 5.
-
-    Cost: about 5 s for 100 frames of a hand on one core.
     """
     shape = Hand() if shape is None else shape
     poses = hand_motion(shape, motion, num_frames, fps, bend=bend, distance=distance, seed=seed)

@@ -71,9 +71,6 @@ class StereoView:
         height: pixels per column.
         disparity_noise: standard deviation of the disparity, pixels.
         lateral_noise: standard deviation of both picture coordinates, pixels.
-
-    Raises:
-        InputError: if a number is not positive; both kinds of noise may be zero.
     """
 
     baseline: float = 0.1

@@ -13,10 +13,6 @@ def write_atomic(path: Path, content: bytes) -> None:
     Args:
         path: the file to write; its folder must exist.
         content: of the file.
-
-    Raises:
-        FileNotFoundError: if the folder does not exist.
-        IsADirectoryError: if ``path`` is a folder.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file in it")

@@ -44,9 +44,6 @@ def save_bvh(
         fps: frames per second.
         ends: (J, 3) points at rest at which the joints without children end; at the joints by default.
         up: the axis that is upright, turned to y; left as it is by default.
-
-    Raises:
-        InputError: if shapes or values do not fit, there are several roots, or a joint slides in its parent.
     """
     target = Path(path)
     if target.suffix.lower() != ".bvh":

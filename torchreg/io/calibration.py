@@ -172,10 +172,6 @@ def load_depth_camera(
         path: a file of one camera, see `load_cameras`, which may have depth_scale, or depth_units, depth_factor, ...
         limits: ``max_bytes`` applies.
 
-    Raises:
-        FormatError: as `load_cameras`, and if there are several cameras.
-        FileNotFoundError: if there is no such file.
-
     Warns:
         FileWarning: as `load_cameras`.
     """
@@ -201,22 +197,13 @@ def save_cameras(path: str | os.PathLike[str], cameras: CameraRig) -> None:
     Args:
         path: a ``.json`` file; its folder must exist.
         cameras: at least one.
-
-    Raises:
-        FormatError: if the name has another ending.
-        FileNotFoundError: if the folder does not exist.
     """
     entries = [_entry(camera) for camera in cameras]
     _write(path, {"format": FORMAT, "version": _VERSION, "cameras": entries})
 
 
 def save_depth_camera(path: str | os.PathLike[str], camera: Camera, depth_scale: float = MILLIMETER) -> None:
-    """Write the camera of a depth image as JSON, see `load_depth_camera`.
-
-    Raises:
-        FormatError: if the name does not end in ``.json``.
-        FileNotFoundError: if the folder does not exist.
-    """
+    """Write the camera of a depth image as JSON, see `load_depth_camera`."""
     _write(path, _entry(camera) | {"depth_scale": depth_scale})
 
 

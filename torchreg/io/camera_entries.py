@@ -70,9 +70,6 @@ def own_entry(given: Mapping[str, Any], where: str) -> dict[str, Any]:
     Args:
         given: a JSON or YAML object.
         where: it is from, for messages.
-
-    Raises:
-        FormatError: if a lens is of another kind, a matrix is none, or an entry seems to be misspelled.
     """
     given = _flat(given)
     entry = {name: given[name] for name in OWN if name in given}
@@ -106,9 +103,6 @@ def _flat(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def depth_unit(given: Mapping[str, Any], where: str) -> float | None:
     """Return the metres per unit of depth images that a camera's object tells, under any name; None if it does not.
-
-    Raises:
-        FormatError: if it is no positive number, or told twice and not the same.
 
     Warns:
         FileWarning: if a number can only be the inverse of what its name says.

@@ -40,10 +40,6 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
 
     Returns:
         The cameras, float64.
-
-    Raises:
-        FormatError: if a line is cut off or not understood, a lens is of another kind, or an image names no camera.
-        FileNotFoundError: if one of the files is missing.
     """
     directory = local_path(folder)
     lenses = _lenses(directory / "cameras.txt", limits)
@@ -65,10 +61,6 @@ def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
     Args:
         folder: must exist.
         cameras: their names must not hold blanks.
-
-    Raises:
-        InputError: if a name holds blanks.
-        FileNotFoundError: if the folder does not exist.
     """
     directory = local_path(folder)
     lenses = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]

@@ -46,9 +46,6 @@ def detected_keypoints(
         side: "left" or "right": of several hands the surest of that side; None for the surest at all. A single hand of
             MediaPipe is taken whatever its side, which a mirrored picture swaps.
         picture: (width, height), pixels, by which MediaPipe's are multiplied.
-
-    Raises:
-        FormatError: if it is neither MediaPipe's nor OpenPose's, or the picture's size is missing.
     """
     if isinstance(frame.get("people"), list):
         hands = _of_openpose(frame["people"], file)

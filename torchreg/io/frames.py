@@ -195,12 +195,6 @@ def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
 
     Returns:
         Paths of the files, in order.
-
-    Raises:
-        InputError: if there are no frames, one is not finite, of the wrong shape or, for a folder, empty; or if the
-            folder holds other point files, which `load_frames` would take for frames.
-        FormatError: if the path is an address or has another ending than .npz.
-        FileNotFoundError: if the folder of ``path`` does not exist.
     """
     target = local_path(path)
     clouds = [as_float_tensor(frame, f"frames[{number}]").detach().cpu() for number, frame in enumerate(frames)]

@@ -84,10 +84,6 @@ def load_rig(
     Returns:
         The rig; without inverse bind matrices, the node hierarchy gives ``joint_transforms``.
 
-    Raises:
-        FormatError: if the file is damaged, oversized, refers outside its folder, or is compressed by what is not read.
-        ModelError: if there is no rig in it, or the rig is cyclic, non-finite or without weights.
-
     Warns:
         FileWarning: if something was left out or put right: primitives without positions or skin, vertices without
             weight (they follow the nearest vertex that has some), joints that move nothing and were stored without a

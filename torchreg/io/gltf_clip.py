@@ -22,10 +22,6 @@ def pose_nodes(document: GltfDocument, time: float | None, frame: int | None) ->
         document: whose nodes are changed in place.
         time: seconds, held inside the clip; None leaves the pose at rest unless ``frame`` is given.
         frame: number of the keyframe, from zero; -1 is the last.
-
-    Raises:
-        FormatError: if there is no animation, or it is damaged.
-        InputError: if there is no such keyframe, or both are given.
     """
     if time is None and frame is None:
         return

@@ -73,9 +73,6 @@ class DracoGeometry:
             accessor: its number.
             what: it holds, for messages.
             shape: (N, W) that it claims.
-
-        Raises:
-            FormatError: if DracoPy is not installed, or the data are damaged.
         """
         source = self._sources.get(accessor)
         if source is None:

@@ -45,12 +45,6 @@ def save_vertex_animation(
     Returns:
         The path written.
 
-    Raises:
-        InputError: if shapes, ranges or values do not fit.
-        InputTypeError: if an argument does not hold numbers of the right kind.
-
-    Cost: 24 bytes per vertex and frame, six times as much as the tracks of a skeleton for small meshes.
-
     References: the glTF 2.0 specification, section 3.7.2.2, on morph targets.
     """
     target = checked_path(path)

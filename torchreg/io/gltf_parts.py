@@ -42,9 +42,6 @@ def read_parts(document: GltfDocument, name: str, limits: FileLimits) -> RigidPa
         document: of the file.
         name: of the base, where it is no node.
         limits: on files.
-
-    Raises:
-        ModelError: if nothing moves.
     """
     parents = document.node_parents()
     shown = sorted(shown_nodes(document))

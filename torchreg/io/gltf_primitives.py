@@ -119,9 +119,6 @@ def read_surface(budget: VertexBudget, meshes: Sequence[int], num_joints: int) -
         budget: of the rig.
         meshes: their numbers.
         num_joints: of the skin that moves them; 0 for meshes without one.
-
-    Raises:
-        FormatError, ModelError: if they are damaged.
     """
     document = budget.document
     blocks: list[tuple[Array, Array | None, Array]] = []

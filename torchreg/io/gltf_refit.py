@@ -74,11 +74,6 @@ def save_refitted_rig(
         vertices: (V, 3) in the bind pose, in the order of `load_rig`, metres.
         positions: (3,) of each joint in the bind pose by its name, metres.
         skin: name or index of the one skin, as given to `load_rig`; all by default.
-
-    Raises:
-        InputError: if vertices or joints are not those of the file, a bone has another direction, nothing is skinned,
-            or joints scale their parts of the skin unlike others.
-        FormatError, ModelError: if the file cannot be read, see `load_rig`.
     """
     target, file = checked_path(path), local_path(source)
     with warnings.catch_warnings(), naming(file):

@@ -154,10 +154,6 @@ def save_animated_parts(
 
     Returns:
         The path written.
-
-    Raises:
-        InputError: if shapes, ranges or values do not fit, or a transform is not rigid.
-        InputTypeError: if an argument does not hold numbers of the right kind.
     """
     target = checked_path(path)
     names = [f"part_{index}" for index in range(len(part_meshes))] if part_names is None else list(part_names)

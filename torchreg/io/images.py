@@ -36,12 +36,7 @@ _EXR_CHANNELS = ("Z", "depth.Z", "Depth.Z", "Y", "V", "R", "RGB")
 
 
 def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
-    """Return the pictures in a folder, in the order of the numbers in their names.
-
-    Raises:
-        FormatError: if it holds none, or is no folder.
-        FileNotFoundError: if there is no such folder.
-    """
+    """Return the pictures in a folder, in the order of the numbers in their names."""
     directory = local_path(folder)
     if not directory.exists():
         raise FileNotFoundError(f"the folder {directory} does not exist")
@@ -54,13 +49,7 @@ def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
-    """Return the pictures of several cameras frame by frame: one folder per camera, in the order of their numbers.
-
-    Raises:
-        FormatError: as `list_pictures`, if the folders do not hold equally many pictures, or a frame is missing in one
-            of them: the last numbers in the names are partly the same, but not frame by frame.
-        FileNotFoundError: if there is no such folder.
-    """
+    """Return the pictures of several cameras frame by frame: one folder per camera, in the order of their numbers."""
     files = [list_pictures(folder) for folder in folders]
     if len({len(found) for found in files}) > 1:
         counts = ", ".join(f"{os.fspath(folder)} {len(found)}" for folder, found in zip(folders, files, strict=True))
@@ -79,10 +68,6 @@ def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIM
     Args:
         path: a PNG, JPEG, TIFF or BMP file; transparency is left out.
         limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
-
-    Raises:
-        FormatError: if it is cut off, too large, no picture or of another bit depth; names the file.
-        FileNotFoundError: if there is no such file.
     """
     pixels = _read_pixels(local_path(path), limits)
     return torch.from_numpy(pixels).to(torch.float32).div_(255)
@@ -106,10 +91,6 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
     Args:
         path: a PNG, JPEG, TIFF or BMP file of any bit depth, also with a palette, or a ``.npy`` array (H, W).
         limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
-
-    Raises:
-        FormatError: as `load_image`.
-        FileNotFoundError: if there is no such file.
 
     Warns:
         FileWarning: if the mask keeps all or nothing, or the file holds several labels or a halo.
@@ -142,12 +123,6 @@ def load_depth(
             millimeters where no camera would see that far.
         camera: its picture must have that size.
         limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
-
-    Raises:
-        FormatError: if it is cut off, too large, of another size or bit depth, without any depth, or in a unit in which
-            no camera sees; names the file.
-        FileNotFoundError: if there is no such file.
-        MissingExtraError: if it is an EXR file and the extra ``exr`` is not installed.
 
     Warns:
         FileWarning: if the depths are unlikely in their unit; names them.

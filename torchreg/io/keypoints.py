@@ -35,10 +35,6 @@ def load_keypoints(
         side: "left" or "right", where a detector saw several hands; by default the surest.
         picture: (width, height), pixels, for keypoints of MediaPipe, which are shares of them.
         limits: ``max_bytes`` applies to each file.
-
-    Raises:
-        FormatError: if it is no such list, or frames or keypoints have several sizes; names the file.
-        FileNotFoundError: if there is no such file.
     """
     file = local_path(path)
     files = natural_sorted(file.glob("*.json")) if file.is_dir() else [file]

@@ -33,9 +33,6 @@ class FileLimits:
         max_faces: triangles (or polygons) of one mesh.
         max_zip_ratio: expanded over packed bytes of a compressed file; beyond 32 MB, a twentieth of it.
         max_expanded_bytes: sum of the expanded sizes in one archive.
-
-    Raises:
-        InputError: if a limit is not a positive number.
     """
 
     max_bytes: int = 2 * 1024**3
@@ -100,10 +97,6 @@ def local_path(path: str | os.PathLike[str]) -> Path:
 
     Args:
         path: name of a file on this machine.
-
-    Raises:
-        FormatError: if it is an address such as ``http://``, ``file://`` or ``s3://``, a network share or no file name.
-        InputTypeError: if it is neither a str nor a path.
     """
     if not isinstance(path, (str, os.PathLike)) or isinstance(os.fspath(path), bytes):
         raise InputTypeError(f"path must be a str or a pathlib.Path, got {type(path).__name__}")
@@ -121,11 +114,6 @@ def read_bytes(path: str | os.PathLike[str], limits: FileLimits = DEFAULT_LIMITS
     Args:
         path: the file.
         limits: ``max_bytes`` applies.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        IsADirectoryError: if it is a folder.
-        FormatError: if it is an address, a device, pipe or socket, or larger than allowed.
     """
     file = local_path(path)
     mode = file.stat().st_mode  # before open(), which waits forever on a pipe
@@ -182,9 +170,6 @@ def open_zip(content: bytes, limits: FileLimits = DEFAULT_LIMITS) -> zipfile.Zip
     Args:
         content: the bytes of the archive.
         limits: ``max_zip_ratio`` and ``max_expanded_bytes`` apply to the sum over all members.
-
-    Raises:
-        FormatError: if it is not a zip archive, a member is encrypted or doubled, or it would expand too far.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))

@@ -60,11 +60,7 @@ def _with_columns(rows: Array) -> RawCloud:
 
 
 def array_of(content: bytes, what: str) -> Array:
-    """Return the array in the bytes of a .npy file: real numbers, or a structured array of them.
-
-    Raises:
-        FormatError: if it claims another size than it has, or holds objects; names ``what``.
-    """
+    """Return the array in the bytes of a .npy file: real numbers, or a structured array of them."""
     stream = io.BytesIO(content)
     shape, fortran, dtype = read_npy_header(stream, what)
     if dtype.hasobject or (dtype.names is None and dtype.kind not in "iufb"):
@@ -181,10 +177,6 @@ def load_arrays(
         path: a local file ending in .npz.
         names: of the arrays.
         limits: on the size of the file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FormatError: if it is no archive, or lacks an array or holds one of objects, which are never loaded.
     """
     file = local_path(path)
     content = read_bytes(file, limits)
@@ -216,10 +208,6 @@ def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Tensor]) -> N
     Args:
         path: a local file ending in .npz; an existing one is replaced, whole or not at all.
         arrays: name to tensor.
-
-    Raises:
-        InputError: if the ending is another.
-        FileNotFoundError: if the folder does not exist.
     """
     file = local_path(path)
     if file.suffix.lower() != ".npz":

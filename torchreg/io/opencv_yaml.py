@@ -66,12 +66,6 @@ def load_opencv(
 
     Returns:
         The cameras, float64.
-
-    Raises:
-        FormatError: if the file is cut off, a matrix has another size, a number is not finite, an entry is missing,
-            the lens is a fisheye, or the cameras of a pair are swapped; names the file.
-        FileNotFoundError: if there is no such file.
-        InputError: if ``unit`` is not positive.
     """
     if not (math.isfinite(unit) and unit > 0):
         raise InputError(f"unit must be positive and finite, got {unit}")
@@ -174,10 +168,6 @@ def save_opencv(path: str | os.PathLike[str], cameras: CameraRig) -> None:
     Args:
         path: a ``.yml`` or ``.yaml`` file; its folder must exist.
         cameras: one or two, with pictures of one size.
-
-    Raises:
-        InputError: if there are more, or sizes differ.
-        FileNotFoundError: if the folder does not exist.
     """
     if len(cameras) > 2 or len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise InputError(f"OpenCV files hold one or two cameras with pictures of one size, got {len(cameras)}")

@@ -341,11 +341,6 @@ def save_points(
         normals: (N, 3) or None.
         colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .csv, .npz); stored as bytes.
         faces: (F, 3) vertex indices or None (.ply, .npz).
-
-    Raises:
-        FormatError: if the path is an address or its ending is none of these.
-        InputError: if shapes do not agree, numbers are not finite or the format cannot hold colors or faces.
-        FileNotFoundError: if the folder does not exist.
     """
     file = local_path(path)
     ending = file.suffix.lower()

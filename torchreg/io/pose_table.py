@@ -18,12 +18,7 @@ from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_byte
 def save_pose_table(
     path: str | os.PathLike[str], names: Sequence[str], rows: Sequence[Sequence[float | int | str]]
 ) -> None:
-    """Write rows of numbers and words below a line of names, all digits kept; an existing file is replaced.
-
-    Raises:
-        FormatError: if the ending is not .csv.
-        FileNotFoundError: if the folder does not exist.
-    """
+    """Write rows of numbers and words below a line of names, all digits kept; an existing file is replaced."""
     file = local_path(path)
     if file.suffix.lower() != ".csv":
         raise FormatError(f"{file} must end in .csv")
@@ -43,11 +38,6 @@ def load_pose_table(
         path: with commas, semicolons or tabs between the columns; numbers may have decimal commas.
         names: of the columns that are read, those of them that are there.
         limits: ``max_bytes`` applies.
-
-    Raises:
-        FormatError: if none of the names is there, a row is longer than their line, or an entry is no finite number;
-            names file, row and column.
-        FileNotFoundError: if there is no such file.
     """
     file = local_path(path)
     try:

@@ -30,10 +30,6 @@ def save_swc(path: str | os.PathLike[str], skeleton: Skeleton, comment: str = ""
         path: a local file ending in .swc; an existing one is replaced, whole or not at all.
         skeleton: the tree.
         comment: lines to begin with.
-
-    Raises:
-        InputError: if the ending is another.
-        FileNotFoundError: if the folder does not exist.
     """
     file = local_path(path)
     if file.suffix.lower() != ".swc":

@@ -37,12 +37,6 @@ def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], me
         tensors: name to tensor, of any shape; stored detached, on the CPU.
         metadata: nested dicts (keys are str), lists, tuples (come back as lists), str, bool, int, float, None.
             Infinite and NaN floats are allowed.
-
-    Raises:
-        InputError: if the ending is another, or a metadata key is reserved.
-        InputTypeError: if a value is not a tensor, or metadata holds another type; names the entry.
-        FormatError: if the path is an address.
-        FileNotFoundError: if the folder does not exist.
     """
     file, description = _pair(path)
     stored = dict[str, Tensor]()
@@ -77,11 +71,6 @@ def load_tensors(
     Args:
         path: the .safetensors file; its JSON file must lie beside it.
         limits: ``max_bytes`` applies to each of the two.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FormatError: if the JSON file is missing, either is damaged, or the two do not belong together; names the file.
-        InputError: if the ending is another.
     """
     file, description = _pair(path)
     content = read_bytes(file, limits)

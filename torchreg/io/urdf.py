@@ -74,11 +74,6 @@ def load_urdf(
     Returns:
         The robot. A link without readable visual geometry has its collision geometry.
 
-    Raises:
-        FormatError: if the XML or a mesh is damaged, oversized or unexpanded xacro, or a required mesh is missing.
-        ModelError: if links and joints do not form one finite tree.
-        MissingExtraError: if a COLLADA (.dae) mesh is required and pycollada is not installed.
-
     Warns:
         FileWarning: if something is left out or held fixed, an element has two origins, or angles seem to be degrees.
         UnitsWarning: if links, joints or slides seem to be in another unit than the rest.

@@ -31,10 +31,6 @@ def save_urdf(
         tree: one frame a link, whose offsets do not turn; no joint mimics another.
         links: names of the links, in the order of the tree's frames.
         meshes: of the links in their frames, metres; links without faces get none.
-
-    Raises:
-        FormatError: if the ending is another.
-        FileNotFoundError: if the folder does not exist.
     """
     file = local_path(path)
     if file.suffix.lower() != ".urdf":

@@ -161,7 +161,16 @@ class Hand(ArticulatedShape):
         return float((points - points[0]).norm(dim=-1).max())
 
     def placed_keypoints(self, transforms: Tensor) -> Tensor:
-        """Return 21 keypoints (..., 21, 3), metres: wrist, then thumb to little finger, each from base to tip."""
+        """Return 21 keypoints: wrist, then thumb to little finger, each from its base joint to its tip.
+
+        Args:
+            transforms: (..., 16, 4, 4) ``T_world_part``.
+
+        Returns:
+            (..., 21, 3), metres, as `keypoints`.
+
+        Differentiable: in ``transforms`` and the bone lengths.
+        """
         origins = transforms[..., :3, 3]
         distal = list(self.fingertip_parts)
         tips = origins[..., distal, :] + transforms[..., distal, :3, 2] * self.bone_lengths[distal].unsqueeze(-1)

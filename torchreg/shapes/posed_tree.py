@@ -92,9 +92,6 @@ class PosedTree(nn.Module):
         that carry a part are called like the part, others as in the tree (with "_" where a part has that name). Joints
         are called like the degrees of freedom, but come depth first: pass ``dict(zip(shape.dof_names[6:], pose[6:]))``.
         A joint that mimics another moves by itself there and needs a value of its own.
-
-        Differentiable: its transforms, in the joint values; twice with ``forward_kinematics_tensor(values,
-        analytical_grad=False)``.
         """
         tree = self.kinematics.tree
         names = dict(zip(self.part_index.tolist(), self.part_names, strict=True))
@@ -142,11 +139,6 @@ class PosedTree(nn.Module):
 
         Args:
             values: numbers or tensors (...) that broadcast, metres and radians.
-
-        Raises:
-            InputError: if a name is unknown; the message names the nearest one.
-
-        Differentiable: in the values.
         """
         for name in values:
             if name not in self.dof_names:
@@ -172,8 +164,6 @@ class PosedTree(nn.Module):
 
         Returns:
             (..., num_dofs).
-
-        Differentiable: in both.
         """
         return retract(pose, step)
 
@@ -186,13 +176,23 @@ class PosedTree(nn.Module):
 
         Returns:
             (..., num_dofs); the base's rotation by an angle of at most pi.
-
-        Differentiable: in both, where that angle is below pi.
         """
         return difference(start, end)
 
     def frame_transforms(self, pose: Tensor) -> Tensor:
-        """Return ``T_world_frame`` (..., F, 4, 4) of every frame of the tree in poses (..., num_dofs)."""
+        """Return ``T_world_frame`` of every frame of the tree.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., F, 4, 4).
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
         check_shape(pose, "pose", (self.num_dofs,), batch=True)
         base = rigid_matrix(so3_exp(pose[..., 3:6]), pose[..., :3])
         return base.unsqueeze(-3) @ self.kinematics(pose[..., 6:], self._offset_scales())
@@ -205,11 +205,6 @@ class PosedTree(nn.Module):
 
         Returns:
             (..., P, 4, 4).
-
-        Raises:
-            InputError: if the pose has the wrong size.
-
-        Differentiable: in ``pose`` and `log_length_scales`.
         """
         return self.frame_transforms(pose).index_select(-3, self.part_index)
 
@@ -221,16 +216,20 @@ class PosedTree(nn.Module):
 
         Returns:
             (..., P, 3), metres.
-
-        Raises:
-            InputError: if the pose has the wrong size.
-
-        Differentiable: in ``pose`` and `log_length_scales`.
         """
         return self.placed_keypoints(self.part_transforms(pose))
 
     def placed_keypoints(self, transforms: Tensor) -> Tensor:
-        """Return the keypoints (..., K, 3), metres, for part transforms (..., P, 4, 4) ``T_world_part``."""
+        """Return the keypoints for given part transforms.
+
+        Args:
+            transforms: (..., P, 4, 4) ``T_world_part``.
+
+        Returns:
+            (..., K, 3), metres, as `keypoints`.
+
+        Differentiable: in ``transforms`` and `log_length_scales`.
+        """
         return transforms[..., :3, 3]
 
     def part_twists(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
@@ -244,8 +243,6 @@ class PosedTree(nn.Module):
 
         Returns:
             transforms (..., P, 4, 4) and twists (..., P, num_dofs, 6) as (translation, rotation).
-
-        Differentiable: in ``pose``.
         """
         transforms, linear, angular = self._twists(pose, chart)
         twists = torch.cat([linear, angular], dim=-1).unsqueeze(-3) * self._part_moves.unsqueeze(-1)
@@ -272,8 +269,6 @@ class PosedTree(nn.Module):
 
         Returns:
             Rows (..., 4 P, 3), for each part the transposed ``[R | t]``, and derivatives (..., 4 P, 3, num_dofs).
-
-        Differentiable: in ``pose``.
         """
         transforms, linear, angular = self._twists(pose, chart)
         rows = transforms.mT
@@ -295,7 +290,14 @@ class PosedTree(nn.Module):
         return self._owners
 
     def length_motions(self, frames: Tensor) -> Tensor:
-        """Return the motions (..., F, 3, P), metres, of frames (..., F, 4, 4) as the log length of each part grows."""
+        """Return how far frames move as the logarithm of each part's length grows.
+
+        Args:
+            frames: (..., F, 4, 4) of a pose, see `frame_transforms`.
+
+        Returns:
+            (..., F, 3, P), metres.
+        """
         above = frames[..., [max(joint.parent, 0) for joint in self.kinematics.tree.joints], :3, :3]
         offsets = self.kinematics.lengths.unflatten(-1, (4, 4))[:, :3, 3] * self._offset_scales().unsqueeze(-1)
         offsets = above @ offsets.to(frames).unsqueeze(-1)

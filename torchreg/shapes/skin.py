@@ -97,7 +97,16 @@ class LinearBlendSkin(nn.Module):
         return self.place(stacked_rows(self.shape.part_transforms(pose)))
 
     def place(self, rows: Tensor) -> Tensor:
-        """Return the points (..., N, 3) for part transforms (..., 4 P, 3) as `stacked_rows` stacks them."""
+        """Return the points for given part transforms.
+
+        Args:
+            rows: (..., 4 P, 3) transforms as `stacked_rows` and `Articulation.transform_jacobian` stack them.
+
+        Returns:
+            (..., N, 3), metres; in memory all x come first, then all y, then all z.
+
+        Differentiable: in ``rows``.
+        """
         # The product with the three coordinates as the short left side takes a fifth of the time or less.
         return nn.functional.linear(rows.mT, self.bases()[0]).mT
 
@@ -144,7 +153,11 @@ class LinearBlendSkin(nn.Module):
         return self.turn_normals(stacked_rows(self.shape.part_transforms(pose)))
 
     def turn_normals(self, rows: Tensor) -> Tensor:
-        """Return the unit normals (..., N, 3) for given part transforms, see `place`."""
+        """Return the unit normals (..., N, 3) for given part transforms, see `place`.
+
+        Raises:
+            InputError: if the skin has no normals.
+        """
         normal_basis = self.bases()[1]
         if normal_basis is None:
             raise InputError("this skin has no normals; pass normals= when building it")

@@ -38,13 +38,6 @@ def run_demo(
     Returns:
         The track with the truth. An interruption by the keyboard after the first frame ends the sequence: the result
         then holds the frames done.
-
-    Raises:
-        InputError: if ``num_frames`` is not a positive integer.
-
-    Differentiable: no.
-
-    Cost: about 0.1 s per frame to make it, 0.03 s to track it, and 2 s to find the hand in the first.
     """
     hand = Hand()
     clouds = hand_sequence("bending_palm", num_frames, DEMO_FPS, shape=hand, seed=seed)
