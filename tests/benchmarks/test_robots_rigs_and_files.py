@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from types import SimpleNamespace
 
@@ -238,6 +239,14 @@ def test_a_folder_of_rigs_is_summed_up(load, bar_file, monkeypatch, capsys):
     assert lines[0].startswith("1 of 3 opened")
     assert [row.split()[:2] for row in lines[1:]] == [["loaded", "1"], ["refined", "1"], ["refused", "2"]]
     assert "no node carries both a mesh and a skin" in lines[3]
+
+
+def test_rigs_from_starts_are_near_their_poses(load, bar_file, capsys):
+    load("rig_starts").main([str(bar_file), "--count", "1"])
+    alone, searched = capsys.readouterr().out.splitlines()
+    assert "search never" in alone
+    assert "search auto" in searched
+    assert all(float(re.search(r"error +([\d.]+)%", row)[1]) < 1 for row in (alone, searched))
 
 
 def test_bones_of_rigs_are_measured_grown_and_written(load, bar_file):
