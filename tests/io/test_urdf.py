@@ -366,10 +366,10 @@ def test_collada_comes_in_metres_and_without_its_looks(folder):
     ("name", "content", "words"),
     [
         ("bad.stl", b"solid nothing", r"bad\.stl"),
-        ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: "),
-        ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: "),
+        ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: not a readable stl mesh"),
+        ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: not a readable obj mesh"),
         ("empty.obj", b"v 0 0 0\n", r"empty\.obj"),
-        ("bad.glb", b"glTF", r"bad\.glb: "),
+        ("bad.glb", b"glTF", r"bad\.glb: not a readable glb mesh"),
         ("mesh.fbx", b"x", r"meshes of kind '\.fbx' are not read"),
     ],
 )

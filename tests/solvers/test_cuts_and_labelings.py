@@ -143,7 +143,7 @@ def test_a_flow_that_differs_from_the_cut_is_an_error(monkeypatch):
 
 @given(SEEDS, st.booleans(), st.booleans())
 @example(237, True, False)  # leaves open nodes that nothing holds on either side
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, costly, seams):
     unary, edges, weights = labeling_problem(seed)
     generator = torch.Generator().manual_seed(seed)

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.spines.bodies import STAR, circle, line, moved, similarity, tube
+from tests.spines.bodies import STAR, circle, line, moved, tube
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.geometry.mesh import concatenate, unit_sphere
+from torchreg.geometry.rigid import rigid_matrix, se3_exp
 from torchreg.spines.skeleton.clearance import Inside
 
 BALL = unit_sphere(2, dtype=torch.float64)
@@ -59,13 +60,14 @@ def test_a_tube_has_its_axis_for_a_skeleton(ends):
 
 
 def test_rigid_motion_and_scale_change_nothing_but_coordinates(star, skeleton):
-    mesh, matrix = star.meshes[0], similarity(0, 40.0).float()
+    motion = se3_exp(torch.tensor([3.0, -2.0, 1.0, 0.5, 1.0, -0.7]))
+    mesh, matrix = star.meshes[0], rigid_matrix(40 * motion[:3, :3], motion[:3, 3])
     again = tr.skeletonize(tr.TriangleMesh(moved(mesh.vertices, matrix), mesh.faces))
     expected = skeleton.transformed(matrix)
     assert torch.equal(again.edges, expected.edges)
-    assert torch.allclose(again.nodes, expected.nodes, atol=40 * 5e-4)
-    assert torch.allclose(again.radii, expected.radii, atol=40 * 5e-4)
-    assert torch.allclose(again.frames[:, :, 2], expected.frames[:, :, 2], atol=2e-2)
+    assert torch.allclose(again.nodes, expected.nodes, atol=40 * 2e-4)
+    assert torch.allclose(again.radii, expected.radii, atol=40 * 2e-4)
+    assert torch.allclose(again.frames[:, :, 2], expected.frames[:, :, 2], atol=1e-2)
 
 
 def mixed(mesh):
