@@ -86,7 +86,7 @@ def calibrate_base(
     with torch.no_grad(), one_thread():
         given = read_frames(shape, frames, poses)
         skin = sample_skin(shape, _NUMBERS.num_skin)
-        size, surface = model_size(skin), fitted_surface(shape, skin)
+        size, surface = model_size(skin), fitted_surface(shape)
         models = [PosedModel.of_skin(skin, frame.joints) for frame in given]
         coarse = BaseProblem.of([frame.thinned(_NUMBERS.num_coarse) for frame in given], surface, skin, size)
         base, lead = _best_base(coarse, models)

@@ -50,7 +50,6 @@ class _Around:
     fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
-    aligned: int = 16  # candidates of a skinned rig
     data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
     entries: int = 4_000_000  # of a table in memory
 
@@ -85,9 +84,8 @@ def explore(
     """Return the best poses found around the starts; the problems of a batch are searched together.
 
     Limbs are placed anew from the descended pose. Where that shows that it was in a wrong minimum, candidates are
-    scattered around the start and the best pose so far, and go through `PoseSearch` in one batch.
-
-    All joints of a skinned rig's candidates are aligned instead, see `align_rows`.
+    scattered around the start and the best pose so far, and go through `PoseSearch` in one batch. Of a skinned rig half
+    as many are scattered at once, and all of their joints aligned, see `align_rows`.
 
     Args:
         problem: the batch.
@@ -115,7 +113,7 @@ def _explore(
 ) -> Tensor:
     """Return the best poses of a thorough search from each descent and, where needed, of one from all around."""
     if isinstance(problem.surface, SkinSurface):
-        return _aligned_around(problem, start, descended, generator)
+        return _aligned_around(problem, start, descended, candidates, generator)
     search = PoseSearch(problem, generator)
     before = search.fitted_score(descended)
     poses, scores = search.refine(descended.unsqueeze(1), 1)
@@ -131,10 +129,12 @@ def _explore(
     return best
 
 
-def _aligned_around(problem: AlignProblem, start: Tensor, descended: Tensor, generator: torch.Generator) -> Tensor:
+def _aligned_around(
+    problem: AlignProblem, start: Tensor, descended: Tensor, candidates: int, generator: torch.Generator
+) -> Tensor:
     """Return the best poses of rigs whose candidates around the starts and the descents are aligned whole."""
-    limbs = find_limbs(problem.skin.shape)[0]
-    pool = [_scatter(problem, limbs, center, _AROUND.aligned // 2, generator) for center in (start, descended)]
+    limbs, count = find_limbs(problem.skin.shape)[0], max(1, candidates // 4)
+    pool = [_scatter(problem, limbs, center, count, generator) for center in (start, descended)]
     return fit_rows(problem, align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, generator))[0][:, 0]
 
 

@@ -33,8 +33,6 @@ INLIER_SHARE = 0.02
 PRIOR_SHARE = 0.3
 # Revolute joints with one center make a ball joint from this number on.
 BALL_AXES = 3
-# So many model points follow the surface as closely as a sampling made for that.
-_DENSE_SKIN_POINTS = 2500
 
 
 @dataclass(frozen=True)
@@ -204,7 +202,7 @@ def centered_problem(
         lower, upper = shape.lower - shift, shape.upper - shift
     return AlignProblem(
         skin=skin,
-        surface=fitted_surface(shape, skin),
+        surface=fitted_surface(shape),
         data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0),
         valid=valid,
         origin=origin,
@@ -233,14 +231,11 @@ def joint_precision(shape: Articulation, size: float, std: float | None) -> Tens
     return precision
 
 
-def fitted_surface(shape: Articulation, skin: LinearBlendSkin) -> ShapeSurface:
+def fitted_surface(shape: Articulation) -> ShapeSurface:
     """Return the surface to fit: that of the shape's file where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)
-    if has_rigid_links(shape):
-        return LinkSurface(shape)
-    dense = skin.normals is not None and len(skin) >= _DENSE_SKIN_POINTS
-    return SkinSurface(skin if dense else dense_file_skin(shape))
+    return LinkSurface(shape) if has_rigid_links(shape) else SkinSurface(dense_file_skin(shape))
 
 
 def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
