@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchreg as tr
 from experiments.made_up.shape_sequences import other_hand
-from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, distance_objective
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import range_clouds
 from torchreg.shapes.surface import FusedSurface
@@ -128,7 +128,7 @@ def least_squares(hand: tr.Hand, trial: Trial, variant: str) -> Tensor:
     data = trial.cloud.points[trial.cloud.inliers].unsqueeze(0)
     prior = GaussianPosePrior(trial.starts[variant].unsqueeze(0), prior_precision(hand))
     wide, noise = torch.tensor([1e3 * NOISE]), torch.tensor([NOISE])
-    objective = SurfaceObjective(FusedSurface(hand), data, torch.ones_like(data[..., 0]), wide, noise, prior)
+    objective = distance_objective(FusedSurface(hand), data, torch.ones_like(data[..., 0]), wide, noise, prior)
     with torch.no_grad():
         return levenberg_marquardt(
             objective,

@@ -46,7 +46,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchreg as tr
 from experiments.made_up.shape_sequences import other_hand, rig_sequence
-from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, distance_objective
 from torchreg.datasets.hand import HandCloud, surface_skin
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.geometry.rotation import compose_rotation_vectors
@@ -146,7 +146,7 @@ def least_squares(hand: tr.Hand, clouds: Sequence[HandCloud]) -> Tensor:
     for cloud in clouds:
         data, pose = cloud.points[cloud.inliers][None], cloud.pose[None]
         wide, noise = torch.tensor([0.1]), torch.tensor([NOISE])
-        objective = SurfaceObjective(
+        objective = distance_objective(
             FusedSurface(hand), data, torch.ones_like(data[..., 0]), wide, noise, GaussianPosePrior(pose, precision)
         )
         with torch.no_grad():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, distance_objective, registration_objective
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.e_step import EStep, expectation
 from torchreg.solvers.levenberg_marquardt import Linearization
@@ -53,13 +53,13 @@ def matches(skin):
 
 @pytest.fixture(scope="module")
 def registration(skin, matches):
-    return RegistrationObjective(skin, matches, SIGMA, PRIOR)
+    return registration_objective(skin, matches, SIGMA, PRIOR)
 
 
 @pytest.fixture(scope="module")
 def surface_fit(links, skin):
     valid = torch.arange(50) < torch.tensor([[50], [30]])
-    return SurfaceObjective(FusedSurface(links), data_near(skin, poses(), 50), valid, WIDTHS, NOISE, PRIOR)
+    return distance_objective(FusedSurface(links), data_near(skin, poses(), 50), valid, WIDTHS, NOISE, PRIOR)
 
 
 def test_the_registration_cost_is_equation_20(skin, matches, registration):
@@ -84,7 +84,7 @@ def test_the_registration_gradient_is_that_of_the_data_likelihood(skin):
         kernel = (-squares / (2 * SIGMA.square())[:, None, None]).exp()
         return -(kernel.sum(-2) + c).log().sum(-1)
 
-    objective = RegistrationObjective(skin, expectation(skin(pose), data, SIGMA, c), SIGMA, NO_PRIOR)
+    objective = registration_objective(skin, expectation(skin(pose), data, SIGMA, c), SIGMA, NO_PRIOR)
     expected = differences(skin.shape, likelihood, pose, 1e-5)
     torch.testing.assert_close(objective(pose).gradient, expected, rtol=1e-6, atol=1e-6)
 
@@ -100,16 +100,16 @@ def test_the_surface_cost_is_equations_21_and_22(links, surface_fit):
     """As the Welsch function, whose weights are beta."""
     pose, found = poses(), surface_fit(poses()).cost
     for row, (count, sigma, noise) in enumerate(((50, 0.02, 0.004), (30, 0.04, 0.008))):
-        distances = links.distance(surface_fit.data[row, :count], pose[row])
+        distances = links.distance(surface_fit.data.data[row, :count], pose[row])
         expected = sum(sigma**2 * (1 - float((-(d**2) / sigma**2).exp())) / (2 * noise**2) for d in distances)
         expected += float((PRIOR.precision * (pose[row] - PRIOR.mean[row]) ** 2).sum()) / 2
         assert float(found[row]) == pytest.approx(expected, rel=1e-10)
 
 
 def test_the_surface_hessian_is_j_transposed_beta_j(links, surface_fit):
-    pose, data = poses(), surface_fit.data
+    pose, data = poses(), surface_fit.data.data
     jacobian = differences(links, lambda trial: links.distance(data, trial), pose, 1e-6)
-    beta = (-(links.distance(data, pose) / WIDTHS[:, None]).square()).exp() * surface_fit.valid
+    beta = (-(links.distance(data, pose) / WIDTHS[:, None]).square()).exp() * surface_fit.data.valid
     # The base is damped by a tenth of one datum: per metre, and per radian at a lever of one metre.
     damping = torch.cat([torch.full((6,), 0.1), torch.zeros(2)]).double() / WIDTHS.square().unsqueeze(-1)
     weights = (beta / NOISE[:, None].square()).unsqueeze(-1)
@@ -130,11 +130,11 @@ def test_model_points_without_data_and_padding_do_not_count(skin, matches, surfa
     weights[:, ::2], targets[:, ::2] = 1e-13, 1e3
     few = EStep(weights, targets, matches.inlier_posterior, matches.squared_error)
     none = EStep(weights * (weights > 1e-12), matches.targets, matches.inlier_posterior, matches.squared_error)
-    moved = surface_fit.data.clone()
+    moved = surface_fit.data.data.clone()
     moved[1, 30:] += 5.0
-    padded = SurfaceObjective(surface_fit.surface, moved, surface_fit.valid, WIDTHS, NOISE, PRIOR)
+    padded = distance_objective(surface_fit.data.surface, moved, surface_fit.data.valid, WIDTHS, NOISE, PRIOR)
     pairs = (
-        (RegistrationObjective(skin, few, SIGMA, NO_PRIOR), RegistrationObjective(skin, none, SIGMA, NO_PRIOR)),
+        (registration_objective(skin, few, SIGMA, NO_PRIOR), registration_objective(skin, none, SIGMA, NO_PRIOR)),
         (padded, surface_fit),
     )
     for changed, plain in pairs:

@@ -5,7 +5,7 @@ import torch
 
 from tests.alignment.made import D, finger
 from torchreg.alignment.implicit_gradient import FixedPoint, solve_symmetric
-from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, distance_objective
 from torchreg.shapes.surface import FusedSurface
 
 
@@ -38,7 +38,7 @@ def test_the_energy_and_its_gradient_are_those_of_the_surface_fit(shape, given):
     data, pose, start = given
     fixed = fixed_point(shape)
     prior = GaussianPosePrior(start, fixed.precision, holds_base=True)
-    objective = SurfaceObjective(fixed.surface, data, fixed.valid, fixed.sigma, fixed.noise, prior)
+    objective = distance_objective(fixed.surface, data, fixed.valid, fixed.sigma, fixed.noise, prior)
     around = objective(pose)
     torch.testing.assert_close(fixed.energy(torch.zeros_like(pose), pose, data, start), around.cost)
     gradient, hessian = fixed.derivatives(pose, data, start)
@@ -58,7 +58,7 @@ def test_newton_steps_make_a_pose_stationary_and_never_worse(shape, given):
     prior = GaussianPosePrior(start, fixed.precision, holds_base=True)
     before = start
     after = fixed.newton_steps(before, data, start, 6)
-    objective = SurfaceObjective(fixed.surface, data, fixed.valid, fixed.sigma, fixed.noise, prior)
+    objective = distance_objective(fixed.surface, data, fixed.valid, fixed.sigma, fixed.noise, prior)
     sizes = [
         (objective(pose).gradient * fixed.free(pose, objective(pose).gradient)).norm(dim=-1) for pose in (before, after)
     ]

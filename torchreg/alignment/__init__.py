@@ -6,8 +6,8 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 - the annealed EM: `anneal`, `outlier_level`;
 - the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
 - the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `fit_candidates`, `score_candidates`;
-- free space: `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`; measured keypoints:
-  `MeasuredKeypoints`, `keypoint_skin`; recursive shape coefficients: `PersonFilter`, `KnownPerson`;
+- evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
+  measured keypoints: `MeasuredKeypoints`, `keypoint_skin`; recursive shape coefficients: `PersonFilter`, `KnownPerson`;
 - what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `near_outlier_share`, `limb_ends`,
   `end_motions`, `end_variances`, `dof_confidence`; in words `spread_of`;
 - checks of input: `check_skin`, `floating_origin`, `warn_about_units`, `warn_about_degenerate`;

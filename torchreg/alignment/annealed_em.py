@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.closest_point import closest_point
-from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective
+from torchreg.alignment.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.sigma_schedule import SigmaSchedule, estimate_sigma
@@ -87,7 +87,7 @@ def anneal(
             posed = problem.skin.place(rows)
             matches = _match(problem, rows, posed, sigma)
             prior = _tempered_prior(problem, matches)
-            objective = RegistrationObjective(problem.skin, matches, sigma, prior, problem.landmarks)
+            objective = registration_objective(problem.skin, matches, sigma, prior, problem.factors)
             around = objective.linearize(pose, rows, derivative)
             if m_steps > 1:
                 solved = problem.solve(objective, pose, m_steps, around, damping)

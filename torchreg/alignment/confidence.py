@@ -147,8 +147,7 @@ def _covariance(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals
     noise = surface_noise(residuals.distance, problem.valid, problem.size)
     width = SURFACE_FIT.width_per_noise * noise
     near = welsch_weight((residuals.distance / width.unsqueeze(-1)).square()) * problem.valid
-    covariance = pose_covariance(residuals.jacobian, near, noise, precision)
-    return covariance if problem.landmarks is None else problem.landmarks.informed(covariance, pose)
+    return problem.informed(pose_covariance(residuals.jacobian, near, noise, precision), pose)
 
 
 def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:

@@ -72,8 +72,7 @@ def curvature(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals |
     precision = plausible_precision(problem, pose)
     fitted = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
     covariance = _sure_covariance(jacobian, near, noise * shared.sqrt(), precision)
-    if problem.landmarks is not None:
-        fitted, covariance = (problem.landmarks.informed(each, pose) for each in (fitted, covariance))
+    fitted, covariance = (problem.informed(each, pose) for each in (fitted, covariance))
     gain = _gain(problem, pose, distance, jacobian, noise, fitted) / shared.square()
     if problem.prior_precision is not None:
         # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.limb_search import distinct_first, take_rows
-from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective
+from torchreg.alignment.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.pose_proposer import Proposals
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
 from torchreg.alignment.problem import AlignProblem, joint_precision
@@ -103,7 +103,7 @@ def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
         total = weight.sum(1)
         targets = weight.mT @ proposals.points / total.clamp_min(1e-9).unsqueeze(-1)
         matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
-        objective = RegistrationObjective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
+        objective = registration_objective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
         for _ in range(_FIT.matched_steps):
             pose = problem.step(objective(pose), pose).state
     return pose

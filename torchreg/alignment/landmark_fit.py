@@ -13,6 +13,7 @@ from torchreg.alignment.curvature import plausible_precision
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints, keypoint_extent
 from torchreg.alignment.limb_search import distinct_first
+from torchreg.alignment.objectives import Objective
 from torchreg.alignment.observability import dof_confidence, told_open
 from torchreg.alignment.pose_search import mean_distances
 from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem, centered_problem
@@ -26,7 +27,6 @@ from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.solvers.levenberg_marquardt import Linearization
 
 
 @dataclass(frozen=True)
@@ -49,23 +49,6 @@ _SEARCH = _Search()
 
 
 @dataclass(frozen=True, eq=False)
-class _Objective:
-    """The likelihood of keypoints and the prior."""
-
-    problem: AlignProblem
-    landmarks: Landmarks
-    width: float
-
-    def __call__(self, pose: Tensor) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
-        return self.problem.prior.add_to(self.landmarks.linearized(pose, self.width), pose)
-
-    def cost(self, pose: Tensor) -> Tensor:
-        """Return the cost alone (B,)."""
-        return self.landmarks.cost(pose, self.width) + self.problem.prior.cost(pose)
-
-
-@dataclass(frozen=True, eq=False)
 class KeypointFit:
     """Poses (S, num_dofs), best and different ones first, costs (S,), and the lead () over the next different one."""
 
@@ -77,9 +60,10 @@ class KeypointFit:
     @property
     def landmarks(self) -> Landmarks:
         """The measured keypoints."""
-        if self.problem.landmarks is None:
+        found = self.problem.factor(Landmarks)
+        if found is None:
             raise InputError("keypoints are needed where there are no data; give both, or data")
-        return self.problem.landmarks
+        return found
 
     @property
     def right(self) -> Tensor:
@@ -128,7 +112,7 @@ def fit_keypoints(
     pool = problem.clamp_candidates(pool[None])[0]
     for width in widths:
         pool = _descended(problem, pool, width * problem.size)
-    best = _objective(problem, pool, 0.0).cost(pool).argsort()[: _SEARCH.refined]
+    best = _objective(problem.repeated(len(pool)), 0.0).cost(pool).argsort()[: _SEARCH.refined]
     return _refined(problem, pool[best])
 
 
@@ -154,18 +138,18 @@ def _all_around(problem: AlignProblem) -> Tensor:
     return shifted(poses, -shape.keypoints(poses).mean(-2))
 
 
-def _objective(problem: AlignProblem, pool: Tensor, width: float) -> _Objective:
-    wide = problem.repeated(len(pool))
-    if wide.landmarks is None:
-        raise InputError("keypoints are needed where there are no data; give both, or data")
-    return _Objective(wide, wide.landmarks, width)
+def _objective(wide: AlignProblem, width: float) -> Objective:
+    """Return the likelihood of the keypoints and the prior, at a width in metres."""
+    sigma = torch.full_like(wide.prior.mean[:, 0], width)
+    return Objective(None, wide.factors, wide.prior, sigma, sigma)
 
 
 def _descended(problem: AlignProblem, pool: Tensor, width: float) -> Tensor:
     """Return candidates (S, num_dofs) after damped steps at one width, metres."""
-    objective = _objective(problem, pool, width)
+    wide = problem.repeated(len(pool))
+    objective = _objective(wide, width)
     for _ in range(_SEARCH.steps):
-        pool = objective.problem.step(objective(pool), pool).state
+        pool = wide.step(objective(pool), pool).state
     return pool
 
 
@@ -173,10 +157,11 @@ def _refined(problem: AlignProblem, pool: Tensor) -> KeypointFit:
     """Return candidates (S, num_dofs) refined down to the keypoints' own errors alone, best first."""
     for width in _SEARCH.fine_widths:
         pool = _descended(problem, pool, width * problem.size)
-    objective = _objective(problem, pool, 0.0)
-    poses = objective.problem.solve(objective, pool, _SEARCH.refine_steps, objective(pool)).state
+    wide = problem.repeated(len(pool))
+    objective = _objective(wide, 0.0)
+    poses = wide.solve(objective, pool, _SEARCH.refine_steps, objective(pool)).state
     # The weak prior ranks as it does beside data.
-    costs = objective.landmarks.cost(poses, 0.0) + PRIOR_SHARE * objective.problem.prior.cost(poses)
+    costs = wide.factor_score(poses, 0.0) + PRIOR_SHARE * wide.prior.cost(poses)
     order = costs.argsort()
     poses, costs = poses[order], costs[order]
     apart = mean_distances(problem, poses[None])[0] > _SEARCH.same * problem.size

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_positive
+from torchreg.alignment.factors import Factor
 from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera, lens_jacobian
 from torchreg.geometry.rigid import invert_rigid, transform_points
@@ -36,7 +37,7 @@ LANDMARKS = LandmarkModel()
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class Landmarks(Factor):
     """Measured keypoints of B problems, each a Gaussian about its true place or, with a small share, anywhere.
 
     Targets (B, K, 3) in metres from the origins, or (B, K, 2) pixels (column, row) of a camera; zero if unseen.
@@ -68,17 +69,21 @@ class Landmarks:
         residual = self._measured(self.skin(pose.unsqueeze(1)))[:, 0] - self.targets
         return self.seen & (residual.square().sum(-1) < LANDMARKS.wrong**2 * self.std.square())
 
-    def cost(self, pose: Tensor, width: Tensor | float) -> Tensor:
-        """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs); ``width`` (B,) adds to the std."""
+    def score(self, pose: Tensor, width: float) -> Tensor:
+        """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs); ``width`` adds to the std."""
+        return self.cost(pose, width)
+
+    def cost(self, pose: Tensor, sigma: Tensor | float, noise: Tensor | None = None) -> Tensor:
+        """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs); ``sigma`` (B,) adds to the std."""
         several = pose.reshape(len(pose), -1, pose.shape[-1])
         residual = self._measured(self.skin(several)) - self.targets.unsqueeze(1)
-        square = residual.square().sum(-1) / self._variance(width).unsqueeze(1)
+        square = residual.square().sum(-1) / self._variance(sigma).unsqueeze(1)
         return (_loss(square) * self.seen.unsqueeze(1)).sum(-1).reshape(pose.shape[:-1])
 
-    def linearized(self, pose: Tensor, width: Tensor | float) -> Linearization:
+    def linearized(self, pose: Tensor, sigma: Tensor | float, noise: Tensor | None = None) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
         points, motion = self.skin.jacobian(pose, chart="tangent")
-        variance = self._variance(width)
+        variance = self._variance(sigma)
         residual = self._measured(points.unsqueeze(1))[:, 0] - self.targets
         jacobian = self._slope(points) @ motion
         square = residual.square().sum(-1) / variance

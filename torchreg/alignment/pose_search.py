@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.limb_search import Effort, LimbSearch, distinct_first, take_rows
-from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem, free_space_loss, landmark_loss
+from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
 from torchreg.alignment.surface_fit import surface_steps
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.skin import LinearBlendSkin
@@ -164,4 +164,4 @@ def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tens
     distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
     outliers = welsch_loss((distance / (width * problem.size)).square())
     scores = (outliers * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
-    return scores + free_space_loss(problem, poses, width) + landmark_loss(problem, poses, width)
+    return scores + problem.factor_score(poses, width)

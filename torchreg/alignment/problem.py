@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from torchreg.alignment.factors import Factor
 from torchreg.alignment.free_space_term import FreeSpaceTerm
-from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints, keypoint_skin
+from torchreg.alignment.landmarks import MeasuredKeypoints, keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior, Objective
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
@@ -27,6 +29,7 @@ from torchreg.solvers.levenberg_marquardt import (
 )
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
+OneFactor = TypeVar("OneFactor", bound=Factor)
 # Data nearer to the fitted surface than this share of the model's size are inliers.
 INLIER_SHARE = 0.02
 # Weight of the prior in a score, in outliers per half squared standard deviation.
@@ -73,9 +76,8 @@ class AlignProblem:
     outlier: str | float = "limit"
     debias: float = 0.0
     correspondence: str = "em"
-    free_space: FreeSpaceTerm | None = None
+    factors: tuple[Factor, ...] = ()
     prior_precision: Tensor | None = None
-    landmarks: Landmarks | None = None
     normals: Tensor | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
@@ -89,8 +91,7 @@ class AlignProblem:
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index], precision=_rows(self.prior.precision, index)),
             prior_precision=None if self.prior_precision is None else self.prior_precision[index],
-            free_space=None if self.free_space is None else self.free_space.rows(index),
-            landmarks=None if self.landmarks is None else self.landmarks.rows(index),
+            factors=tuple(factor.rows(index) for factor in self.factors),
             normals=None if self.normals is None else self.normals[index],
         )
 
@@ -107,15 +108,26 @@ class AlignProblem:
 
     def with_data(self, data: Tensor, valid: Tensor) -> AlignProblem:
         """Return the problem with a sample of its data (B, M, 3), valid or not (B, M), that stands for all."""
-        space = self.free_space
-        if space is not None:
-            space = space.thinned(self.valid.sum(-1) / valid.sum(-1).clamp_min(1))
-        return replace(self, data=data, valid=valid, free_space=space)
+        thinning = self.valid.sum(-1) / valid.sum(-1).clamp_min(1)
+        return replace(self, data=data, valid=valid, factors=tuple(each.thinned(thinning) for each in self.factors))
 
     def with_skin(self, skin: LinearBlendSkin) -> AlignProblem:
         """Return the problem with other model points that cover the shape as evenly."""
-        space = None if self.free_space is None else self.free_space.for_skin(skin)
-        return replace(self, skin=skin, free_space=space)
+        return replace(self, skin=skin, factors=tuple(factor.for_skin(skin) for factor in self.factors))
+
+    def factor(self, kind: type[OneFactor]) -> OneFactor | None:
+        """Return the factor of a kind, None without one."""
+        return next((factor for factor in self.factors if isinstance(factor, kind)), None)
+
+    def informed(self, covariance: Tensor, pose: Tensor) -> Tensor:
+        """Return the covariance (B, num_dofs, num_dofs) that data give poses, with what the factors add."""
+        for factor in self.factors:
+            covariance = factor.informed(covariance, pose)
+        return covariance
+
+    def factor_score(self, pose: Tensor, width: float) -> Tensor | float:
+        """Return the score of all factors (B, ...) at poses (B, ..., num_dofs); ``width`` is a share of the size."""
+        return sum((factor.score(pose, width * self.size) for factor in self.factors), 0.0)
 
     def plausible_limits(self, reach: float) -> tuple[Tensor, Tensor]:
         """Return limits (B, num_dofs) of the pose, narrowed to ``reach`` standard deviations about the prior's mean."""
@@ -197,7 +209,11 @@ def centered_problem(
     shape, size = skin.shape, model_size(skin)
     shift = torch.nn.functional.pad(origin, (0, shape.num_dofs - 3))
     lower, upper = shape.lower, shape.upper
-    term = None if free_space is None else FreeSpaceTerm.of_skin(free_space.to(data).moved(origin), skin, size)
+    factors: list[Factor] = []
+    if free_space is not None:
+        factors.append(FreeSpaceTerm.of_skin(free_space.to(data).moved(origin), skin, size))
+    if keypoints is not None:
+        factors.append(keypoints.of_problems(keypoint_skin(shape), origin))
     if not bool(torch.isinf(shape.lower[:3]).all()):
         lower, upper = shape.lower - shift, shape.upper - shift
     return AlignProblem(
@@ -214,8 +230,7 @@ def centered_problem(
         outlier=outlier,
         debias=debias,
         correspondence=correspondence,
-        free_space=term,
-        landmarks=None if keypoints is None else keypoints.of_problems(keypoint_skin(shape), origin),
+        factors=tuple(factors),
     )
 
 
@@ -243,24 +258,15 @@ def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
     return welsch_weight((distances / (INLIER_SHARE * problem.size)).square()) * problem.valid
 
 
-def alignment_cost(
-    problem: AlignProblem, pose: Tensor, distances: Tensor | None = None, intruding: Tensor | float | None = None
-) -> Tensor:
+def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
     """Return the cost (B,) that ranks alignments: soft counts of outliers and of points in free space, and a prior."""
-    intruding = free_space_loss(problem, pose, INLIER_SHARE) if intruding is None else intruding
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
     cost = (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
-    return cost + intruding + landmark_loss(problem, pose, INLIER_SHARE)
+    return cost + problem.factor_score(pose, INLIER_SHARE)
 
 
-def landmark_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:
-    """Return the negative log-likelihood (B, ...) of the landmarks; zero without any; see `free_space_loss`."""
-    return 0.0 if problem.landmarks is None else problem.landmarks.cost(pose, width * problem.size)
-
-
-def free_space_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:
-    """Return the data (B, ...), softly counted, that model points in free space stand for; ``width`` times the size."""
-    if problem.free_space is None:
-        return 0.0
-    return problem.free_space.loss(problem.skin(pose), width * problem.size)
+def free_space_loss(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the data (B,), softly counted, that model points in free space stand for; zero without a picture."""
+    term = problem.factor(FreeSpaceTerm)
+    return torch.zeros_like(pose[:, 0]) if term is None else term.score(pose, INLIER_SHARE * problem.size)

@@ -16,7 +16,7 @@ from torchreg.alignment.confidence import EVIDENCE, SurfaceResiduals, end_spread
 from torchreg.alignment.curvature import curvature, plausible_precision
 from torchreg.alignment.observability import dof_confidence, far_variance, told_open
 from torchreg.alignment.other_explanations import open_rims, planes_instead
-from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, free_space_loss
+from torchreg.alignment.problem import AlignProblem, free_space_loss
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
@@ -197,7 +197,7 @@ def gather_evidence(
         beside=near_outlier_share(problem, distance),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
         spread=spreads.mean(-1),
-        intruding=free_space_loss(problem, pose, INLIER_SHARE),
+        intruding=free_space_loss(problem, pose),
         lead=lead,
     )
 
@@ -209,7 +209,7 @@ def weigh(
     beside: Tensor,
     clustered: Tensor,
     spread: Tensor,
-    intruding: Tensor | float,
+    intruding: Tensor,
     lead: Tensor | None = None,
 ) -> Evidence:
     """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,)."""
@@ -217,7 +217,6 @@ def weigh(
     least = SURFACE_FIT.min_noise(problem.size)
     count = problem.valid.sum(-1).clamp_min(1).to(distance)
     near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
-    intruding = torch.zeros_like(noise) + intruding
     lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
     return Evidence(
         noise=(noise / least).log() / math.log(SURFACE_FIT.max_noise(problem.size) / least),

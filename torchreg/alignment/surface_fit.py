@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import OnStep, StageResult, report_step
-from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, Objective, distance_objective
 from torchreg.alignment.problem import AlignProblem
 from torchreg.solvers.levenberg_marquardt import LMResult
 
@@ -111,9 +111,9 @@ def surface_steps(problem: AlignProblem, pose: Tensor, sigma: Tensor, noise: Ten
 
 def surface_objective(
     problem: AlignProblem, sigma: Tensor, noise: Tensor, prior: GaussianPosePrior | None = None
-) -> SurfaceObjective:
+) -> Objective:
     """Return the objective of a surface fit at kernel widths (B,) and noise levels (B,), with the problem's prior."""
-    return SurfaceObjective(
+    return distance_objective(
         surface=problem.surface,
         data=problem.data,
         valid=problem.valid,
@@ -121,8 +121,7 @@ def surface_objective(
         noise=noise,
         prior=prior or problem.prior,
         lever=SURFACE_FIT.lever * problem.size,
-        free_space=None if problem.free_space is None else (problem.free_space, problem.skin),
-        landmarks=problem.landmarks,
+        factors=problem.factors,
     )
 
 

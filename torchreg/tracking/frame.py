@@ -129,7 +129,7 @@ class FrameFit:
     residual: Tensor
     change: float
     cost: float
-    intruding: Tensor | float
+    intruding: Tensor
     num_inliers: int
     unexplained: Tensor
     num_new_unexplained: int

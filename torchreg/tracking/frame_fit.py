@@ -14,6 +14,7 @@ from torchreg.alignment.annealed_em import anneal
 from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, near_outlier_share
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.curvature import hardly_gains
+from torchreg.alignment.factors import Factor
 from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
 from torchreg.alignment.landmarks import keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior
@@ -104,8 +105,7 @@ class FrameFitter:
             valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
             prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
-            free_space=self._free_space(frame, origin, num_in_reach / len(data)),
-            landmarks=None if frame.keypoints is None else frame.keypoints.of_problems(self._keypoints, origin[None]),
+            factors=self._factors(frame, skin or self.skin, origin, num_in_reach / len(data)),
         )  # fmt: skip
         if frame.known is not None:
             informed = frame.known.near(origin).with_prior(problem, local[None])
@@ -117,12 +117,15 @@ class FrameFitter:
     def _keypoints(self) -> LinearBlendSkin:
         return keypoint_skin(self.shape)
 
-    def _free_space(self, frame: Frame, origin: Tensor, thinning: float) -> FreeSpaceTerm | None:
-        """Return what a picture says against poses about an origin (3,), whose data each stand for some of its own."""
-        if frame.picture is None:
-            return None
-        space = frame.picture.free_space.to(origin).moved(origin).thinned(origin.new_tensor([thinning]))
-        return FreeSpaceTerm(space, self._skin_area, INTRUSION.tolerance * self.size)
+    def _factors(self, frame: Frame, skin: LinearBlendSkin, origin: Tensor, thinning: float) -> tuple[Factor, ...]:
+        """Return what a frame says of poses about an origin (3,) beside data that each stand for some of its own."""
+        factors: list[Factor] = []
+        if frame.picture is not None:
+            space = frame.picture.free_space.to(origin).moved(origin).thinned(origin.new_tensor([thinning]))
+            factors.append(FreeSpaceTerm(space, skin, self._skin_area, INTRUSION.tolerance * self.size))
+        if frame.keypoints is not None:
+            factors.append(frame.keypoints.of_problems(self._keypoints, origin[None]))
+        return tuple(factors)
 
     def look(self, state: TrackState, frame: Frame, pose: Tensor) -> FrameView | None:
         """Return the frame as seen from the predicted pose (num_dofs,), with the model points that were seen last.
@@ -200,12 +203,12 @@ class FrameFitter:
         transforms = self.shape.part_transforms(pose[0])
         unexplained = self.clusters.find(problem.data[0], distance[0], residual)
         moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
-        intruding = free_space_loss(problem, pose, INLIER_SHARE)
+        intruding = free_space_loss(problem, pose)
         wide_prior = GaussianPosePrior(problem.prior.mean, self._joint_precision(FILTER.max_joint_std))
         return FrameFit(
             view=view, pose=pose, distance=distance, jacobian=fitted.jacobian, transforms=transforms,
             residual=residual, change=float(fitted.change),
-            cost=float(alignment_cost(replace(problem, prior=wide_prior), pose, distance, intruding)),
+            cost=float(alignment_cost(replace(problem, prior=wide_prior), pose, distance)),
             intruding=intruding, num_inliers=int((distance.abs() < self.inlier_distance).sum()),
             unexplained=unexplained, num_new_unexplained=self.clusters.count_new(state, unexplained, transforms[0]),
             limit_share=share_at_limits(problem, pose),
@@ -260,7 +263,7 @@ class FrameFitter:
         levers = [fitted.jacobian[0][:, limb.dofs].norm(dim=-1) for limb in self.limbs]
         shown = torch.stack(levers) > _SETTINGS.min_lever * self.size
         counts = (_inlier_weights(fitted.distance[0], residual) * shown).sum(-1).tolist()
-        detected = set() if problem.landmarks is None else problem.landmarks.seen_parts()
+        detected = set[int]().union(*(factor.seen_parts() for factor in problem.factors))
         unseen = [
             limb
             for limb, count in zip(self.limbs, counts, strict=True)
