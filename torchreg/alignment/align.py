@@ -27,7 +27,7 @@ from torchreg.alignment.align_stages import (
 from torchreg.alignment.annealed_em import OnStep, StageResult
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
-from torchreg.alignment.in_picture import surest_crop
+from torchreg.alignment.in_picture import not_found_if_improbable, surest_crop
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
@@ -93,7 +93,8 @@ def align(
         shape: the articulated shape, in metres.
         data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds. Or a
             `DepthFrame`, whose free space counts too, or a sequence of B of them. In a single frame without a mask and
-            without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first.
+            without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first;
+            the status is NOT_FOUND where none is the shape, with a probability of 95 %.
             None, or the `Camera` of keypoints in pixels, where keypoints are all there is.
         initial_pose: (num_dofs,) start, or numbers by name of degree of freedom with the others at rest, moved inside
             the limits first; without one, `find_pose` looks for it.
@@ -163,7 +164,7 @@ def align(
             ),
             partial(source.crop_score, skin),
         )  # fmt: skip
-        return replace(found, crop=crop.mask)
+        return replace(not_found_if_improbable(found), crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
     origin = floating_origin(shape, seen.points)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import candidate_crops
+from torchreg.result import Status
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class Choice:
 
     sure: float = 0.8  # confidence from which on no other crop is tried
     enough: float = CALIBRATION.doubtful  # from which on no surface farther away is
+    absent: float = 0.05  # below which the picture does not show the shape, at the usual level of a test
 
 
 CHOICE = Choice()
@@ -46,6 +48,16 @@ def surest_crop(
         return best
     everything = frame.cropped(frame.measured)
     return answer(everything), everything
+
+
+def not_found_if_improbable(found: AlignResult) -> AlignResult:
+    """Return the result of a whole picture, NOT_FOUND where it hardly shows the shape in the most probable pose."""
+    confidence = _confidence(found)
+    if found.statuses[0].usable or confidence >= CHOICE.absent:
+        return found
+    absent = f"the picture does not show the shape, with probability {1 - confidence:.0%}"
+    doubts = [absent, found.doubt] if isinstance(found.doubt, str) and found.doubt else [absent]
+    return replace(found, status=Status.NOT_FOUND, doubt="; ".join(doubts))
 
 
 def _likely_first(
