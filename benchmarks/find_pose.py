@@ -36,7 +36,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.alignment.pose_proposer import PoseProposer
+from torchreg.alignment.search.pose_proposer import PoseProposer
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, surface_skin
 from torchreg.errors import FormatError

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchreg as tr
 from experiments.made_up.shape_sequences import other_hand
-from torchreg.alignment.objectives import GaussianPosePrior, distance_objective
+from torchreg.alignment.fit.objectives import GaussianPosePrior, distance_objective
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import range_clouds
 from torchreg.shapes.surface import FusedSurface

@@ -39,8 +39,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.alignment.annealed_em import CORRESPONDENCES
-from torchreg.alignment.softassign import softassign
+from torchreg.alignment.fit.annealed_em import CORRESPONDENCES
+from torchreg.alignment.fit.softassign import softassign
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep, expectation
 from torchreg.viz.figures import save_picture

@@ -25,7 +25,7 @@ from shape_fit import MARGIN, Person, error_mm, fit, load_model, make_person, st
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.alignment.reliability import SHAPE_CALIBRATION
+from torchreg.alignment.evidence.reliability import SHAPE_CALIBRATION
 from torchreg.geometry.rotation import compose_rotation_vectors
 
 # Sizes of the mean ones, metres.

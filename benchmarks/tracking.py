@@ -46,7 +46,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchreg as tr
 from experiments.made_up.shape_sequences import other_hand, rig_sequence
-from torchreg.alignment.objectives import GaussianPosePrior, distance_objective
+from torchreg.alignment.fit.objectives import GaussianPosePrior, distance_objective
 from torchreg.datasets.hand import HandCloud, surface_skin
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.geometry.rotation import compose_rotation_vectors

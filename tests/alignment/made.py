@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 import torchreg as tr
-from torchreg.alignment.problem import centered_problem
+from torchreg.alignment.fit.problem import centered_problem
 from torchreg.datasets.hand import make_hand_cloud
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.primitives import Primitive

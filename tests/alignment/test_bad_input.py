@@ -9,7 +9,7 @@ import torch
 import torchreg as tr
 from tests.alignment.made import ARM
 from torchreg.alignment.pseudo_labels import label_frames
-from torchreg.alignment.rough_poses import PrincipalAxes
+from torchreg.alignment.search.rough_poses import PrincipalAxes
 
 INPUT, TYPE = tr.errors.InputError, tr.errors.InputTypeError
 QUICK = tr.FindPoseConfig(num_candidates=2, num_placed=1, num_searched=1, search_rounds=1)

@@ -7,8 +7,8 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import joint, shape_of, solid
-from torchreg.alignment.scale_fit import scale_jacobian
 from torchreg.datasets.hand import hand_motion, make_hand_cloud, random_hand_pose
+from torchreg.shapes.scale_jacobian import scale_jacobian
 
 
 def make_arm(dtype=torch.float32, **options):

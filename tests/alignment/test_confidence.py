@@ -7,7 +7,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import generator, joint, problem_of, shape_of, solid
-from torchreg.alignment.confidence import is_misfit, known_ends, pose_confidence
+from torchreg.alignment.evidence.confidence import is_misfit, known_ends, pose_confidence
 
 SURE = torch.tensor([1e6])
 

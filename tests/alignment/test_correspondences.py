@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchreg.alignment.closest_point import closest_point
-from torchreg.alignment.softassign import softassign
+from torchreg.alignment.fit.closest_point import closest_point
+from torchreg.alignment.fit.softassign import softassign
 from torchreg.solvers import e_step
 from torchreg.solvers.e_step import expectation
 

@@ -7,9 +7,9 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import make_problem
-from torchreg.alignment.annealed_em import anneal
-from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.surface_fit import (
+from torchreg.alignment.fit.annealed_em import anneal
+from torchreg.alignment.fit.objectives import GaussianPosePrior
+from torchreg.alignment.fit.surface_fit import (
     fit_surface,
     pose_covariance,
     residual_noise,

@@ -195,7 +195,7 @@ def test_float32_is_right_far_from_the_origin():
 def test_backpropagation_holds_no_matrix_of_all_pairs():
     code = """
 import resource, torch
-from torchreg.alignment.em_loss import EMLoss
+from torchreg.alignment.fit.em_loss import EMLoss
 posed, data = torch.rand(6000, 3, requires_grad=True), torch.rand(6000, 3)
 loss = EMLoss(0.05)
 loss(posed[:10], data[:10]).backward()

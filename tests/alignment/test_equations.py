@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.objectives import GaussianPosePrior, distance_objective, registration_objective
+from torchreg.alignment.fit.objectives import GaussianPosePrior, distance_objective, registration_objective
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.e_step import EStep, expectation
 from torchreg.solvers.levenberg_marquardt import Linearization

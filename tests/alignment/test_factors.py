@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from tests.alignment.made import problem_of
-from torchreg.alignment.annealed_em import anneal
-from torchreg.alignment.factors import Factor
-from torchreg.alignment.problem import alignment_cost
-from torchreg.alignment.sigma_schedule import SigmaSchedule
-from torchreg.alignment.surface_fit import fit_surface
+from torchreg.alignment.fit.annealed_em import anneal
+from torchreg.alignment.fit.factors import Factor
+from torchreg.alignment.fit.problem import alignment_cost
+from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
+from torchreg.alignment.fit.surface_fit import fit_surface
 from torchreg.solvers.levenberg_marquardt import Linearization
 
 

@@ -8,8 +8,8 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import TIPS, D, cloud, generator, joint, machine, off, problem_of, shape_of, solid
-from torchreg.alignment.problem import alignment_cost
-from torchreg.alignment.rough_poses import PrincipalAxes, UniformRotations, UprightRotations, typical_poses
+from torchreg.alignment.fit.problem import alignment_cost
+from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations, typical_poses
 from torchreg.geometry.rotation import so3_exp, so3_log
 
 QUICK = tr.FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1, num_model_points=200)

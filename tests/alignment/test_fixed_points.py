@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from tests.alignment.made import D, finger
-from torchreg.alignment.implicit_gradient import FixedPoint, solve_symmetric
-from torchreg.alignment.objectives import GaussianPosePrior, distance_objective
+from torchreg.alignment.fit.implicit_gradient import FixedPoint, solve_symmetric
+from torchreg.alignment.fit.objectives import GaussianPosePrior, distance_objective
 from torchreg.shapes.surface import FusedSurface
 
 

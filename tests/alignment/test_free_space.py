@@ -6,8 +6,8 @@ import torch
 import torchreg as tr
 from tests.alignment.conftest import CAMERA
 from tests.alignment.made import problem_of
-from torchreg.alignment.free_space_term import FreeSpaceTerm
-from torchreg.alignment.problem import alignment_cost
+from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
+from torchreg.alignment.fit.problem import alignment_cost
 from torchreg.capture.depth_segments import beyond_cut, candidate_crops
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.landmarks import MeasuredKeypoints, keypoint_skin
+from torchreg.alignment.fit.landmarks import MeasuredKeypoints, keypoint_skin
 
 CAMERA = tr.Camera(640, 480, (475.0, 480.0, 320.0, 240.0), None, (-0.1, 0.03, 1e-3, -2e-3))
 

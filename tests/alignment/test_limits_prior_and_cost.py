@@ -8,7 +8,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import generator, joint, problem_of, shape_of, solid
-from torchreg.alignment.problem import alignment_cost
+from torchreg.alignment.fit.problem import alignment_cost
 
 
 @pytest.fixture(scope="module")

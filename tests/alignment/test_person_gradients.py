@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
-from torchreg.alignment.person_gradient import PairedPlanes
+from torchreg.alignment.fit.implicit_gradient import FixedPoint, attach_gradients
+from torchreg.alignment.shape.person_gradient import PairedPlanes
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree

@@ -8,7 +8,7 @@ import torch
 import torchreg as tr
 import torchreg.alignment.find_pose as find_pose_module
 from torchreg.alignment import train_initializer as train_module
-from torchreg.alignment.pose_proposer import HAND_WEIGHTS
+from torchreg.alignment.search.pose_proposer import HAND_WEIGHTS
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
 
 TINY = tr.ProposerSize(tokens=16, neighbors=4, width=16, heads=2, encoder=1, decoder=1, hypotheses=2, waves=2)

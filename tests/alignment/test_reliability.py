@@ -7,8 +7,8 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import joint, problem_of, shape_of, solid
-from torchreg.alignment.curvature import correlated_count, curvature, neighbor_correlation
-from torchreg.alignment.reliability import judge
+from torchreg.alignment.evidence.curvature import correlated_count, curvature, neighbor_correlation
+from torchreg.alignment.evidence.reliability import judge
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.pose_algebra import difference
 

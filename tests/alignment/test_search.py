@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.alignment.made import TIPS, generator, off, problem_of
-from torchreg.alignment.local_search import explore, needs_search
-from torchreg.alignment.pose_search import PoseSearch, score_candidates
+from torchreg.alignment.search.local_search import explore, needs_search
+from torchreg.alignment.search.pose_search import PoseSearch, score_candidates
 
 
 @pytest.fixture(scope="module")

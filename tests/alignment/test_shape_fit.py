@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.person_search import limb_restarts
-from torchreg.alignment.shape_fit import _problem
+from torchreg.alignment.shape.person_search import limb_restarts
+from torchreg.alignment.shape.shape_fit import _problem
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
@@ -187,7 +187,7 @@ def test_a_person_found_leaning_is_set_upright(shape, seed, monkeypatch):
         state[:, :3] += problem.data[0].mean(0) - problem.skin(state)[0].mean(0)
         return state
 
-    monkeypatch.setattr("torchreg.alignment.shape_fit.find_people", leaning)
+    monkeypatch.setattr("torchreg.alignment.shape.shape_fit.find_people", leaning)
     result = tr.align(shape, data, fit_shape=True, config=QUICK)
     off = (shape.vertices(result.pose, result.coefficients) - shape.vertices(pose, coefficients)).norm(dim=-1)
     assert float(off.mean()) < 0.02

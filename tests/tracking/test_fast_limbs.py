@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.problem import centered_problem
+from torchreg.alignment.fit.problem import centered_problem
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.primitives import Primitive

@@ -24,10 +24,12 @@ from torchreg.alignment.align_stages import (
     refit_uncropped,
     search_where_needed,
 )
-from torchreg.alignment.annealed_em import OnStep, StageResult
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.observability import dof_confidence
+from torchreg.alignment.evidence.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
-from torchreg.alignment.in_picture import not_found_if_improbable, surest_crop
+from torchreg.alignment.fit.annealed_em import OnStep, StageResult
+from torchreg.alignment.fit.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
@@ -37,15 +39,13 @@ from torchreg.alignment.inputs import (
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
-from torchreg.alignment.observability import dof_confidence
-from torchreg.alignment.person_gradient import person_with_gradients
-from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
-from torchreg.alignment.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
-from torchreg.alignment.start_source import StartSource
+from torchreg.alignment.search.in_picture import not_found_if_improbable, surest_crop
+from torchreg.alignment.search.landmark_fit import align_keypoints, measured_alone
+from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
+from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.shape.person_gradient import person_with_gradients
+from torchreg.alignment.shape.shape_fit import fit_coefficients, fitted_rig
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera

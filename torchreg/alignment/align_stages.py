@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal, outlier_level
-from torchreg.alignment.curvature import curvature
-from torchreg.alignment.local_search import explore, needs_search
-from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost
+from torchreg.alignment.evidence.curvature import curvature
+from torchreg.alignment.fit.annealed_em import ANNEALING, OnStep, StageResult, anneal, outlier_level
+from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, alignment_cost
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.results import AlignRecord
-from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.alignment.search.local_search import explore, needs_search
 from torchreg.geometry.budget import BUDGET
 from torchreg.result import normal_copy
 from torchreg.shapes.pose_algebra import shifted

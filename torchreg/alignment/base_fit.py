@@ -12,8 +12,8 @@ from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg.alignment.base_frames import BaseFrame
-from torchreg.alignment.patches import independent_share
-from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
+from torchreg.alignment.fit.patches import independent_share
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.rigid import rigid_matrix

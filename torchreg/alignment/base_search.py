@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.base_frames import BaseFrame
-from torchreg.alignment.rough_poses import spread_rotations
+from torchreg.alignment.search.rough_poses import spread_rotations
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, transform_points
 from torchreg.geometry.sampling import farthest_points

@@ -13,13 +13,13 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.fit.problem import model_size
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.found_frames import FramePoses
 from torchreg.alignment.inputs import check_clouds
-from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
-from torchreg.alignment.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
-from torchreg.alignment.shape_fit import fit_coefficients, shared_covariance
-from torchreg.alignment.surface_fit import SURFACE_FIT
+from torchreg.alignment.shape.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
+from torchreg.alignment.shape.shape_fit import fit_coefficients, shared_covariance
 from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape

@@ -18,9 +18,9 @@ from torchreg.alignment.base_fit import BASE_FIT, BaseFit, BaseProblem, approach
 from torchreg.alignment.base_frames import BaseFrame, read_frames
 from torchreg.alignment.base_search import PosedModel, rank_bases, search_base, seen_shares
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.problem import fitted_surface, model_size
+from torchreg.alignment.fit.problem import fitted_surface, model_size
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.results import BaseCalibration
-from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import TorchregWarning
 from torchreg.geometry.rigid import invert_rigid, transform_points

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.alignment.confidence import explains, is_misfit, pose_confidence
-from torchreg.alignment.in_picture import surest_crop
+from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
+from torchreg.alignment.evidence.reliability import CALIBRATION, without_cut
+from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
@@ -23,16 +24,15 @@ from torchreg.alignment.inputs import (
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
-from torchreg.alignment.limb_search import distinct_first, take_rows
-from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.pose_search import PoseSearch, mean_distances
-from torchreg.alignment.problem import AlignProblem, centered_problem, masked_mean, model_size
-from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.results import PoseStarts
-from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
-from torchreg.alignment.start_source import StartSource
-from torchreg.alignment.whole_alignment import align_rows, best_distinct, best_first, fit_rows
+from torchreg.alignment.search.in_picture import surest_crop
+from torchreg.alignment.search.landmark_fit import find_keypoints, measured_alone
+from torchreg.alignment.search.limb_search import distinct_first, take_rows
+from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
+from torchreg.alignment.search.pose_search import PoseSearch, mean_distances
+from torchreg.alignment.search.rough_poses import PoseSource, bent_pose, register_rigidly
+from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.search.whole_alignment import align_rows, best_distinct, best_first, fit_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.far_origin import to_local, to_world

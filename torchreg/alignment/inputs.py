@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_shape
-from torchreg.alignment.landmarks import MeasuredKeypoints, keypoint_extent
-from torchreg.alignment.problem import model_size
+from torchreg.alignment.fit.landmarks import MeasuredKeypoints, keypoint_extent
+from torchreg.alignment.fit.problem import model_size
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
-from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.patches import errors_per_patch
-from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
+from torchreg.alignment.fit.objectives import GaussianPosePrior
+from torchreg.alignment.fit.patches import errors_per_patch
+from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem
 from torchreg.errors import InputError, InputTypeError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, shifted

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchreg._checks import check_positive
 from torchreg.alignment.align import align
+from torchreg.alignment.fit.problem import INLIER_SHARE, model_size
 from torchreg.alignment.inputs import floating_origin
 from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer
-from torchreg.alignment.problem import INLIER_SHARE, model_size
 from torchreg.alignment.results import AlignResult
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.datasets.pose_labels import PoseLabel

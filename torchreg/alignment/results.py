@@ -60,8 +60,8 @@ class AlignResult(Result):
         covariance: (num_dofs, num_dofs) of the pose in tangent coordinates (base: translation, then a rotation composed
             from the left), from the curvature of the last fit's objective, with data that err together counted once.
         confidence: probability, from 0 to 1, that the ends of the limbs are right to a twentieth of the shape's size on
-            average; calibrated on made-up data, see `alignment.reliability`.
-        evidence: (E,) what the confidence rests on, see `alignment.reliability.Evidence`.
+            average; calibrated on made-up data, see `alignment.evidence.reliability`.
+        evidence: (E,) what the confidence rests on, see `alignment.evidence.reliability.Evidence`.
         doubt: what is doubtful, in a sentence, and what the data do not determine, whatever the status; empty where
             nothing is. A tuple for a batch.
         crop: (H, W) bool, the pixels of a whole depth picture in which the shape was found; distances, inliers and

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
-from torchreg.alignment.pose_proposer import PoseProposer, ProposerSize, RawPoses, posed_points
+from torchreg.alignment.search.pose_proposer import PoseProposer, ProposerSize, RawPoses, posed_points
 from torchreg.datasets.cloud_batches import CloudBatch, random_clouds, random_poses
 from torchreg.errors import FormatError
 from torchreg.io.limits import local_path

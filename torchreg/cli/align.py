@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from torchreg.alignment.config import AlignConfig
-    from torchreg.alignment.pose_proposer import PoseProposer
     from torchreg.alignment.results import AlignResult
+    from torchreg.alignment.search.pose_proposer import PoseProposer
     from torchreg.geometry.upright import Direction
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin

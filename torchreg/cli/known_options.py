@@ -16,8 +16,8 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.alignment.pose_proposer import PoseProposer
     from torchreg.alignment.results import AlignResult
+    from torchreg.alignment.search.pose_proposer import PoseProposer
     from torchreg.capture.depth_frame import DepthFrame
     from torchreg.shapes.articulated import ArticulatedShape
 
@@ -37,7 +37,7 @@ def read_initializer(path: Path | None, shape: ArticulatedShape, side: str | Non
         return None
     if side == "either":
         raise InputError("--initializer cannot be used with --side either; it is a network for one of the hands")
-    from torchreg.alignment.pose_proposer import PoseProposer
+    from torchreg.alignment.search.pose_proposer import PoseProposer
 
     return PoseProposer.load(path, shape)
 
@@ -207,7 +207,7 @@ def _read_angle(text: str | None) -> float:
 
 def observability(shape: ArticulatedShape, result: AlignResult) -> str:
     """Return in a sentence which joints the data do not hold; empty if they hold all."""
-    from torchreg.alignment.observability import spread_of
+    from torchreg.alignment.evidence.observability import spread_of
 
     if result.covariance is None:
         return ""

@@ -8,8 +8,8 @@ from typing import Any, TypeGuard
 
 from torch import Tensor
 
-from torchreg.alignment.clusters import CLUSTERS
-from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.evidence.clusters import CLUSTERS
+from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.tracking.frame import MIN_DATA, FrameFit
 from torchreg.tracking.motion_model import FILTER
 from torchreg.tracking.results import TrackState

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg.alignment.annealed_em import ANNEALING
+from torchreg.alignment.fit.annealed_em import ANNEALING
+from torchreg.alignment.fit.landmarks import MeasuredKeypoints
+from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.inputs import UNITS
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.landmarks import MeasuredKeypoints
-from torchreg.alignment.problem import AlignProblem
-from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import stacked_rows

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg.alignment.annealed_em import outlier_level
-from torchreg.alignment.observability import dof_confidence
-from torchreg.alignment.reliability import CALIBRATION, confidence_of
+from torchreg.alignment.evidence.observability import dof_confidence
+from torchreg.alignment.evidence.reliability import CALIBRATION, confidence_of
+from torchreg.alignment.fit.annealed_em import outlier_level
 from torchreg.result import Status
 from torchreg.solvers.e_step import expectation
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit

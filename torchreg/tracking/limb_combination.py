@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.pose_search import SEARCH_BUDGET
-from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
-from torchreg.alignment.surface_fit import surface_steps
+from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem
+from torchreg.alignment.fit.surface_fit import surface_steps
+from torchreg.alignment.search.pose_search import SEARCH_BUDGET
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.primitives import fuse
 from torchreg.solvers.cover import best_covers

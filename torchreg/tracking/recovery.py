@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
-from torchreg.alignment.pose_search import PoseSearch, fit_candidates, score_candidates
-from torchreg.alignment.problem import centered_problem
-from torchreg.alignment.start_source import StartSource
-from torchreg.alignment.surface_fit import SURFACE_FIT
+from torchreg.alignment.fit.problem import centered_problem
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT
+from torchreg.alignment.search.pose_search import PoseSearch, fit_candidates, score_candidates
+from torchreg.alignment.search.start_source import StartSource
 from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.pose_algebra import difference, shifted

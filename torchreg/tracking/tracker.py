@@ -15,12 +15,12 @@ from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_ab
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.fit.landmarks import MeasuredKeypoints
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.landmarks import MeasuredKeypoints
-from torchreg.alignment.person_filter import KnownPerson, PersonFilter
-from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.start_source import StartSource
+from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
+from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.shape.person_filter import KnownPerson, PersonFilter
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import to_local, to_world

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.clusters import CLUSTERS, OFF_SURFACE
+from torchreg.alignment.evidence.clusters import CLUSTERS, OFF_SURFACE
 from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.limbs import Limb

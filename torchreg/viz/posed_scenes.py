@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_shape
-from torchreg.alignment.problem import INLIER_SHARE
+from torchreg.alignment.fit.problem import INLIER_SHARE
 from torchreg.datasets.hand import faces_of
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction

@@ -1,0 +1,160 @@
+"""The confidence in poses found without a start: rivals, near outliers, limbs without data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.evidence.clusters import OFF_SURFACE, OffSurface, clustered_data
+from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, soft_inliers
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, pose_covariance, surface_noise
+from torchreg.shapes.limbs import Limb, find_limbs
+from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.solvers.robust import welsch_weight
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Scales of the evidence for a pose, at which its factor of the confidence is 1 / e, or 1 - 1 / e."""
+
+    tolerance: float = 0.04  # of the ends of limbs: their mean distance from the true ones, as a share of the size
+    lead: float = 4.0  # over a different pose, in data that it explains more
+    left_over: float = 0.1  # data beside the surface or in clusters, as a share of those on it
+    limb_data: float = 4.0  # data that nothing but one limb explains
+    num_data: int = 2000  # that are looked at: more show no more limbs
+
+
+@dataclass(frozen=True)
+class _Misfit:
+    """Thresholds of a misfit: too many near outliers."""
+
+    reach: float = 0.05  # of data beside the surface, at most, as a share of the model's size
+    share: float = 0.025  # of the data: more are a misfit
+
+
+EVIDENCE = Evidence()
+_MISFIT = _Misfit()
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceResiduals:
+    """Distances (B, M) of data from the surface in some poses, metres, their Jacobian, and `limb_data` (B, L)."""
+
+    distance: Tensor
+    jacobian: Tensor
+    limb_data: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem, pose: Tensor) -> SurfaceResiduals:
+        """Return how the data of a batch lie in poses (B, num_dofs)."""
+        return cls(*problem.surface.distance_jacobian(problem.data, pose), limb_data(problem, pose))
+
+
+def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
+    """Return the confidence (B,) in fitted poses from the ``lead`` over rivals, misfit, clusters and limbs' ends."""
+    return explains(problem, pose, lead) * known_ends(problem, pose)
+
+
+def explains(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
+    """Return the confidence (B,) without the observability factor, which no search would improve."""
+    left = left_over(problem, pose)
+    return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left / EVIDENCE.left_over).exp()
+
+
+def left_over(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the near outliers and data in dense clusters (B,), as a share of the data on the surface."""
+    clustered, near = clustered_data(problem, pose)
+    return clustered.to(pose) / near.clamp_min(1) + near_outlier_share(
+        problem, problem.surface.distance(problem.data, pose)
+    )
+
+
+def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return a mask (B,) of poses that leave too many data near the surface; outliers are spread more thinly."""
+    return (
+        near_outlier_share(problem, problem.surface.distance(problem.data, pose), OffSurface(noises=0.0))
+        > _MISFIT.share
+    )
+
+
+def near_outlier_share(problem: AlignProblem, distance: Tensor, off: OffSurface = OFF_SURFACE) -> Tensor:
+    """Return the share (B,) of data at distances (B, M) that lie off the surface, but not far."""
+    noise = surface_noise(distance, problem.valid, problem.size)
+    beyond = off.distance(noise, problem.size).unsqueeze(-1)
+    beside = (distance.abs() > beyond) & (distance.abs() < _MISFIT.reach * problem.size) & problem.valid
+    return beside.sum(-1).to(problem.data) / problem.valid.sum(-1).clamp_min(1)
+
+
+def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the probability (B,), by Rayleigh's distribution, that the ends of limbs lie within the tolerance."""
+    spread = end_spreads(problem, pose).mean(-1)
+    return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
+
+
+def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Tensor:
+    """Return the deviations (B, L) of the limbs' ends, metres; a limb without data of its own spreads by the prior."""
+    if problem.data.shape[-2] > EVIDENCE.num_data:
+        problem, residuals = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None
+    residuals = residuals or SurfaceResiduals.of(problem, pose)
+    moves = end_motions(problem.skin, pose, limb_ends(problem.skin))
+    # What the prior leaves free is plausible, at least.
+    prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
+    variances = prior.reciprocal()
+    variances[..., :BASE_DOFS] = 0
+    loose = (moves.square() * variances[..., None, None, :]).sum((-2, -1))
+    covariance = _covariance(problem, pose, residuals, prior)
+    fitted = end_variances(moves, covariance)
+    alone = (-residuals.limb_data / EVIDENCE.limb_data).exp()
+    return (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
+
+
+def end_motions(skin: LinearBlendSkin, pose: Tensor, ends: Tensor) -> Tensor:
+    """Return the derivatives (B, L, 3, num_dofs) of some points (L,) of a skin in poses, in tangent coordinates."""
+    _, derivative = skin.shape.transform_jacobian(pose, chart="tangent")
+    return (skin.basis[ends] @ derivative.flatten(-2)).unflatten(-1, (3, -1))
+
+
+def end_variances(moves: Tensor, covariance: Tensor) -> Tensor:
+    """Return the variances (B, L) of points with derivatives (B, L, 3, num_dofs), all coordinates together."""
+    spread = (moves.flatten(-3, -2) @ covariance).unflatten(-2, moves.shape[-3:-1])
+    return (spread * moves).sum((-2, -1)).clamp_min(0)
+
+
+def limb_ends(skin: LinearBlendSkin) -> Tensor:
+    """Return the indices (L,) of the skin points farthest out on each limb; of all points without limbs."""
+    transforms = skin.shape.part_transforms(skin.reference_pose)
+    ends = []
+    for limb, index in limb_points(skin):
+        root = transforms[limb.bodies[0].parts[0], :3, 3]
+        ends.append(index[(skin.points[index] - root).norm(dim=-1).argmax()])
+    return torch.stack(ends) if ends else torch.arange(len(skin), device=skin.points.device)
+
+
+def limb_points(skin: LinearBlendSkin) -> list[tuple[Limb, Tensor]]:
+    """Return the limbs that have skin points, with the indices of those."""
+    part = skin.weights.argmax(-1)
+    points = [
+        (limb, torch.isin(part, part.new_tensor(limb.parts)).nonzero()[:, 0]) for limb in find_limbs(skin.shape)[0]
+    ]
+    return [(limb, index) for limb, index in points if len(index)]
+
+
+def _covariance(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals, precision: Tensor) -> Tensor:
+    """Return the covariance (B, num_dofs, num_dofs) of poses, given near data and a prior's precision."""
+    noise = surface_noise(residuals.distance, problem.valid, problem.size)
+    width = SURFACE_FIT.width_per_noise * noise
+    near = welsch_weight((residuals.distance / width.unsqueeze(-1)).square()) * problem.valid
+    return problem.informed(pose_covariance(residuals.jacobian, near, noise, precision), pose)
+
+
+def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the number of data (B, L) that only one limb explains, for each limb; infinity without limbs."""
+    limbs = [limb.parts for limb, _ in limb_points(problem.skin)]
+    explained, *by_rest = soft_inliers(
+        problem, problem.skin.shape.distances_without(problem.data, pose, [(), *limbs])
+    ).unbind(0)
+    counts = [(explained - rest).clamp_min(0).sum(-1) for rest in by_rest]
+    return torch.stack(counts, dim=-1) if counts else torch.full_like(explained[:, :1], torch.inf)

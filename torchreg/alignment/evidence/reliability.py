@@ -1,0 +1,281 @@
+"""How far an alignment can be trusted: the evidence for its pose, and a probability calibrated on made-up data."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import takewhile
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.evidence.clusters import OFF_SURFACE, clusters_beside
+from torchreg.alignment.evidence.confidence import (
+    EVIDENCE,
+    SurfaceResiduals,
+    end_spreads,
+    limb_points,
+    near_outlier_share,
+)
+from torchreg.alignment.evidence.curvature import curvature, plausible_precision
+from torchreg.alignment.evidence.observability import dof_confidence, far_variance, told_open
+from torchreg.alignment.evidence.other_explanations import open_rims, planes_instead
+from torchreg.alignment.fit.problem import AlignProblem, free_space_loss
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.depth_segments import beyond_cut
+from torchreg.shapes.limbs import Limb
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Evidence against poses, (B,) each, from 0 (good) to about 1.
+
+    Args:
+        noise: of the data about the surface, from the least (0) to the largest (1) that a fit assumes, in logarithms.
+        beside: root of the share of near outliers.
+        clusters: root of the data in dense clusters off the surface, as a share of those on it.
+        off: share of the data that are not on the surface.
+        free_space: root of the data that points in free space stand for, as a share of the data.
+        unknown: probability that the data do not determine the ends of the limbs.
+        rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
+        open_rim: square of `open_rims`; zero for clouds.
+        planes: square of `planes_instead`.
+    """
+
+    noise: Tensor
+    beside: Tensor
+    clusters: Tensor
+    off: Tensor
+    free_space: Tensor
+    unknown: Tensor
+    rival: Tensor
+    rival_share: Tensor
+    open_rim: Tensor
+    planes: Tensor
+
+    def table(self) -> Tensor:
+        """Return the numbers as (B, E)."""
+        return torch.stack([getattr(self, item.name) for item in fields(self)], dim=-1)
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """Scales of the evidence."""
+
+    rival_share: float = 0.02  # of the data by which a pose leads: at which a rival counts 1 / e
+    surface_error: float = 0.008  # standard error of a surface, share of the size: where half of the fits are wrong
+    loose_error: float = 0.03  # the same of a part that is told to be hardly seen
+
+
+_SCALES = _Scales()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The logistic model of the confidence: log-odds of a right pose, ``bias - sum_k weight_k evidence_k``.
+
+    A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
+    ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox, and tested on
+    310 others (``docs/measured/confidence.txt``), of which halves give no better one. The last two weights, of what
+    else may explain a picture, are fitted by ``benchmarks/scenes.py --calibrate --count 68``, the others held.
+    """
+
+    bias: float = 5.35
+    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93, 20.44, 3.78)  # as `Evidence` has them
+    right: float = 0.058  # of the size: 15 mm of a hand
+    doubtful: float = 0.5  # confidence below which a result is doubtful
+
+
+CALIBRATION = Calibration()
+# Of fits of pose and shape together, which are right if all of the surface, hidden parts too, is off by at most that
+# share of the size on average: 25 mm of a body of 1.7 m. What is unknown is then the standard error of the surface,
+# which no shape's limbs or number of parts enter. Fitted to 59 made-up people and hands, all from starts, as
+# `benchmarks/shape_confidence.py --calibrate` fits one to what it draws; its area under the curve on 72 others, a third
+# of them searched, is .96. Pictures and rivals were not among the 59: their weights are those of poses.
+SHAPE_CALIBRATION = Calibration(
+    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.44, 3.78), right=0.015
+)
+
+
+@dataclass(frozen=True)
+class SurfaceError:
+    """Standard errors (B,) of a surface fitted with its coefficients, of parts (B, P), and its last motion, metres."""
+
+    whole: Tensor
+    parts: Tensor
+    moved: Tensor
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether the last step moved the surface by no more than is not known of it, (B,)."""
+        return self.moved <= self.whole
+
+    def unknown(self, size: float) -> Tensor:
+        """Return the evidence (B,) that the data do not tell where the surface is, from 0 to 1."""
+        return (-(_SCALES.surface_error * size / self.whole).square()).exp()
+
+    def loose(self, limbs: Sequence[Limb], size: float) -> Tensor:
+        """Return of which limbs the data leave open where they are, (B, L)."""
+        largest = [self.parts[:, limb.parts].amax(-1) for limb in limbs]
+        return torch.stack(largest, -1) > _SCALES.loose_error * size if limbs else self.parts[:, :0] > 0
+
+
+def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> AlignProblem:
+    """Return a problem without the data that a crop cuts off, such as a forearm, in fitted poses (B, num_dofs)."""
+    if len(frames) != len(pose):
+        return problem
+    distance = problem.surface.distance(problem.data, pose)
+    noise = surface_noise(distance, problem.valid, problem.size)
+    off = distance.abs() > OFF_SURFACE.distance(noise, problem.size).unsqueeze(-1)
+    valid = problem.valid.clone()
+    for row, frame in zip(range(len(frames)), frames, strict=True):
+        count = len(frame.points)
+        valid[row, :count] &= ~beyond_cut(frame, off[row, :count])
+    return replace(problem, valid=torch.where(valid.any(-1, keepdim=True), valid, problem.valid))
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Covariance (B, D, D) in tangent coordinates, evidence, confidence (B,) and doubts of fitted poses.
+
+    `dof_confidence` (B, D) is the share of the variance without data that the data removed.
+    """
+
+    covariance: Tensor
+    dof_confidence: Tensor
+    converged: Tensor
+    evidence: Evidence
+    confidence: Tensor
+    doubt: tuple[str, ...]
+
+
+def judge(
+    problem: AlignProblem,
+    pose: Tensor,
+    lead: Tensor | None,
+    error: SurfaceError | None = None,
+    frames: Sequence[DepthFrame] = (),
+) -> Judgement:
+    """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`."""
+    residuals = SurfaceResiduals.of(problem, pose)
+    around, spreads = curvature(problem, pose, residuals), end_spreads(problem, pose, residuals)
+    evidence, calibration = gather_evidence(problem, pose, residuals.distance, lead, spreads), CALIBRATION
+    if frames:
+        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, residuals.distance)
+        evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
+    converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
+    if error is not None:
+        evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
+        limbs = [limb for limb, _ in limb_points(problem.skin)]
+        converged, loose = error.converged, error.loose(limbs, problem.size)
+    shape, precision = problem.skin.shape, plausible_precision(problem, pose)
+    far = far_variance(problem, pose, residuals, noise=around.noise, shared=around.shared, precision=precision)
+    diagonal = around.covariance.diagonal(dim1=-2, dim2=-1)
+    covariance = around.covariance + torch.diag_embed((far - diagonal).clamp_min(0))
+    left_open = [told_open(shape, row, problem.size) for row in covariance]
+    return Judgement(
+        covariance=covariance,
+        dof_confidence=dof_confidence(shape, covariance, problem.size),
+        converged=converged,
+        evidence=evidence,
+        confidence=confidence_of(evidence.table(), calibration),
+        doubt=tuple(
+            "; ".join(filter(None, row))
+            for row in zip(doubt_messages(problem, evidence, loose), left_open, strict=True)
+        ),
+    )
+
+
+def gather_evidence(
+    problem: AlignProblem, pose: Tensor, distance: Tensor, lead: Tensor | None, spreads: Tensor
+) -> Evidence:
+    """Return the evidence for poses (B, num_dofs), with distances (B, M) of the data and `end_spreads` (B, L).
+
+    ``lead`` (B,) is the cost by which the second-best pose of a search was worse; None for given starts.
+    """
+    clustered, on_surface = clusters_beside(problem, distance)
+    return weigh(
+        problem,
+        distance,
+        beside=near_outlier_share(problem, distance),
+        clustered=clustered.to(pose) / on_surface.clamp_min(1),
+        spread=spreads.mean(-1),
+        intruding=free_space_loss(problem, pose),
+        lead=lead,
+    )
+
+
+def weigh(
+    problem: AlignProblem,
+    distance: Tensor,
+    *,
+    beside: Tensor,
+    clustered: Tensor,
+    spread: Tensor,
+    intruding: Tensor,
+    lead: Tensor | None = None,
+) -> Evidence:
+    """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,)."""
+    noise = surface_noise(distance, problem.valid, problem.size)
+    least = SURFACE_FIT.min_noise(problem.size)
+    count = problem.valid.sum(-1).clamp_min(1).to(distance)
+    near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
+    lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
+    return Evidence(
+        noise=(noise / least).log() / math.log(SURFACE_FIT.max_noise(problem.size) / least),
+        beside=beside.sqrt(),
+        clusters=clustered.sqrt().clamp_max(1),
+        off=1 - near / count,
+        free_space=(intruding / count).sqrt().clamp_max(1),
+        unknown=(-(EVIDENCE.tolerance * problem.size / spread).square()).exp(),
+        rival=(-lead / EVIDENCE.lead).exp(),
+        rival_share=(-lead / (_SCALES.rival_share * count)).exp(),
+        open_rim=torch.zeros_like(noise),
+        planes=torch.zeros_like(noise),
+    )
+
+
+def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> Tensor:
+    """Return the calibrated probabilities (B,) that poses with evidence (B, E) are right."""
+    return torch.sigmoid(calibration.bias - evidence @ evidence.new_tensor(calibration.weights))
+
+
+def doubt_messages(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
+    """Return the doubts about poses, a sentence each, empty where there is none; loose (B, L) limbs are named."""
+    limbs = [limb for limb, _ in limb_points(problem.skin)]
+    sentences = []
+    for row, loose_limbs in enumerate(loose.tolist()):
+        reasons = []
+        unseen = [_limb_name(problem, limb) for limb, is_loose in zip(limbs, loose_limbs, strict=False) if is_loose]
+        if unseen:
+            reasons.append(f"hardly any data show where {', '.join(unseen)} end{'s' * (len(unseen) == 1)}")
+        reasons += [
+            text.format(getattr(evidence, name)[row].item() ** 2)
+            for name, limit, text in _REASONS
+            if float(getattr(evidence, name)[row]) > limit
+        ]
+        sentences.append("; ".join(reasons))
+    return tuple(sentences)
+
+
+# Evidence from which on a reason is told, and its words; {} is the square of the evidence.
+_REASONS = (
+    ("rival", 0.37, "another pose explains nearly as much"),
+    ("clusters", 0.2, "data in clusters off the shape are {:.0%} of those on it"),
+    ("beside", 0.3, "{:.0%} of the data lie beside the shape's surface"),
+    ("free_space", 0.2, "parts of the shape lie where the picture shows nothing"),
+    ("open_rim", 0.25, "the surface goes on where the shape ends, as a wall or a table does"),
+    ("planes", 0.2, "flat faces explain the data better than the shape"),
+)
+
+
+def _limb_name(problem: AlignProblem, limb: Limb) -> str:
+    """Return the name of a limb: what its parts' names begin with, and its side, or that of its last part."""
+    names = [problem.skin.shape.part_names[part] for part in limb.parts]
+    letters = takewhile(lambda column: len(set(column)) == 1, zip(*names, strict=False))
+    common = "".join(column[0] for column in letters).rstrip("_-. 0")
+    side = re.search(r"[._](?:l|r|left|right)$", names[-1], re.IGNORECASE)
+    return common + (side[0] if side else "") if len(names) > 1 and common else names[-1]

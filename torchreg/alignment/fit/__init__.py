@@ -1,0 +1,1 @@
+"""The fits of poses to data: annealed EM, surface distances, further factors."""

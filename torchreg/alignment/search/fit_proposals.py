@@ -1,0 +1,109 @@
+"""Proposed poses on the data: a coarse fit of several per cloud in one batch, and the choice of the best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
+from torchreg.alignment.fit.problem import AlignProblem, joint_precision
+from torchreg.alignment.search.limb_search import distinct_first, take_rows
+from torchreg.alignment.search.pose_proposer import Proposals
+from torchreg.alignment.search.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
+from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.solvers.e_step import EStep
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Numbers of the fit; widths are shares of the model's size."""
+
+    kept: int = 2  # most probable proposals, beside that fitted to matches
+    surface_std: float = 0.015  # of where the network says that a datum lies on the shape
+    sigma: float = 0.02  # of a datum about the model point
+    reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
+    joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
+    matched_steps: int = 2  # in each round
+    widths: tuple[float, ...] = (0.05, 0.03, 0.02)  # of the kernel, from what a proposal errs by to a searched pose's
+    steps: int = 2  # at each width
+    score_width: float = 0.022  # as in the search
+    same: float = 0.05  # fitted poses whose points differ by less are duplicates
+
+
+_FIT = _Fit()
+
+
+@dataclass(frozen=True, eq=False)
+class BestProposal:
+    """The pose (B, num_dofs) that explains most data, the mean of its prior, and its lead (B,) over the next."""
+
+    pose: Tensor
+    mean: Tensor
+    lead: Tensor
+
+
+@torch.no_grad()
+def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
+    """Return the pose that explains most data after a coarse fit, with the network's joints as the prior."""
+    told = with_proposed_prior(problem, proposals)
+    coarse = PoseSearch(told, torch.Generator().manual_seed(0)).coarse_problem
+    poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
+    fitted, scores = _fitted(coarse, torch.cat([matched_pose(told, proposals).unsqueeze(1), poses], dim=1))
+    apart = mean_distances(coarse, fitted)[:, 0] > _FIT.same * problem.size
+    share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
+    lead = torch.where(apart, scores, torch.inf).amin(1) - scores[:, 0]
+    best = fitted[:, 0]
+    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), lead * share)
+
+
+@torch.no_grad()
+def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
+    """Return ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first."""
+    coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
+    poses = problem.clamp_candidates(proposals.poses)
+    number = poses.shape[1]
+    wide = problem.repeated(number)
+    wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
+    matched = matched_pose(wide, proposals.repeated(number)).reshape(poses.shape)
+    fitted, _ = _fitted(coarse, torch.cat([poses, matched], dim=1))
+    order = distinct_first(mean_distances(coarse, fitted) < _FIT.same * problem.size)[:, :count]
+    return take_rows(fitted, torch.cat([order, order[:, -1:].expand(-1, count - order.shape[1])], dim=1))
+
+
+def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
+    """Return a problem whose prior's mean is the most probable proposal, except in joints with a prior."""
+    mean = problem.clamp_candidates(proposals.poses[:, :1])[:, 0]
+    precision = joint_precision(problem.skin.shape, problem.size, _FIT.joint_std)
+    if problem.prior_precision is None:
+        return replace(problem, prior=GaussianPosePrior(mean, precision))
+    told, prior = problem.prior_precision > 0, problem.prior
+    mean, precision = torch.where(told, prior.mean, mean), torch.where(told, prior.precision, precision)
+    return replace(problem, prior=replace(prior, mean=mean, precision=precision))
+
+
+def _fitted(coarse: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Return poses (B, K, num_dofs) after a coarse fit, best first, and their scores (B, K)."""
+    fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
+    scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
+    return take_rows(fitted, order), scores
+
+
+def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
+    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest."""
+    skin, sigma, pose = problem.skin, _FIT.sigma * problem.size, problem.prior.mean
+    near = torch.cdist(proposals.surface, skin.points).square()
+    told = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1) * proposals.inlier.unsqueeze(-1)
+    for width in (None, *_FIT.reach):
+        weight = told
+        if width is not None:
+            far = torch.cdist(proposals.points, skin(pose)) / (width * problem.size)
+            weight = told * (-0.5 * far.square()).exp()
+        total = weight.sum(1)
+        targets = weight.mT @ proposals.points / total.clamp_min(1e-9).unsqueeze(-1)
+        matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
+        objective = registration_objective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
+        for _ in range(_FIT.matched_steps):
+            pose = problem.step(objective(pose), pose).state
+    return pose

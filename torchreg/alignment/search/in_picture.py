@@ -1,0 +1,72 @@
+"""A shape in a whole picture: the crops that may show it are tried, and the surest answer is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.results import AlignResult, PoseStarts
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.depth_segments import candidate_crops
+from torchreg.result import Status
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How the crops of a picture are tried."""
+
+    sure: float = 0.8  # confidence from which on no other crop is tried
+    enough: float = CALIBRATION.doubtful  # from which on no surface farther away is
+    absent: float = 0.05  # below which the picture does not show the shape, at the usual level of a test
+
+
+CHOICE = Choice()
+Answer = TypeVar("Answer", AlignResult, PoseStarts)
+
+
+def surest_crop(
+    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], crop_score: Callable[[DepthFrame], float]
+) -> tuple[Answer, DepthFrame]:
+    """Return the answer of highest confidence for the crops of a frame, and that crop; near ones are tried first."""
+    best: tuple[Answer, DepthFrame] | None = None
+    for crops in candidate_crops(frame, size):
+        for crop, is_likely in _likely_first(crops, crop_score):
+            # What needs a search is tried where no other crop is believed.
+            if best is not None and not is_likely and _confidence(best[0]) >= CHOICE.enough:
+                break
+            found = answer(crop)
+            if best is None or _confidence(found) > _confidence(best[0]):
+                best = found, crop
+            if _confidence(found) >= CHOICE.sure:
+                return best
+        # Farther surfaces are tried where no end of a nearer one may be the shape.
+        if best is not None and _confidence(best[0]) >= CHOICE.enough:
+            return best
+    if best is not None:
+        return best
+    everything = frame.cropped(frame.measured)
+    return answer(everything), everything
+
+
+def not_found_if_improbable(found: AlignResult) -> AlignResult:
+    """Return the result of a whole picture, NOT_FOUND where it hardly shows the shape in the most probable pose."""
+    confidence = _confidence(found)
+    if found.statuses[0].usable or confidence >= CHOICE.absent:
+        return found
+    absent = f"the picture does not show the shape, with probability {1 - confidence:.0%}"
+    doubts = [absent, found.doubt] if isinstance(found.doubt, str) and found.doubt else [absent]
+    return replace(found, status=Status.NOT_FOUND, doubt="; ".join(doubts))
+
+
+def _likely_first(
+    crops: Iterable[DepthFrame], crop_score: Callable[[DepthFrame], float]
+) -> list[tuple[DepthFrame, bool]]:
+    """Return crops, the likeliest first, and whether they are likely to show anything without a search."""
+    seen = sorted(((crop_score(crop), crop) for crop in crops), key=lambda pair: -pair[0])
+    return [(crop, likely >= CHOICE.enough) for likely, crop in seen]
+
+
+def _confidence(found: Any) -> float:
+    return float(found.confidence)

@@ -1,0 +1,1 @@
+"""Poses together with shape coefficients and sizes."""
