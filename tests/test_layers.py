@@ -35,7 +35,7 @@ LAYERS = [
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 SYSTEMS = {"alignment", "tracking", "registration", "spines"}
 # One system that may import another, or one module that may.
-BRIDGES = {("tracking", "alignment"), ("alignment/search/skeleton_source.py", "spines")}
+BRIDGES = {("tracking", "alignment"), ("alignment/skeleton_source.py", "spines")}
 # Two rooms of one system that know nothing of each other.
 APART = {("registration/dense", "registration/bones"), ("registration/bones", "registration/dense")}
 
@@ -282,7 +282,7 @@ def test_the_layer_check_finds_what_is_wrong(path, source):
         ),
         ("shapes/hand.py", "from torchreg.io.urdf import read\nfrom torchreg.errors import ModelError\nimport math"),
         ("shapes/hand.py", "from ..geometry.mesh import TriangleMesh"),
-        ("alignment/search/skeleton_source.py", "from torchreg.spines.skeletonize import skeletonize"),
+        ("alignment/skeleton_source.py", "from torchreg.spines.skeletonize import skeletonize"),
         ("tracking/tracker.py", "from torchreg.alignment.align import align"),
         ("registration/register.py", "import torchreg.registration.dense.align_scans"),
         ("cli/application.py", "from torchreg import __version__\nfrom torchreg import metrics"),

@@ -23,7 +23,7 @@ _NAMES = {
     "alignment.search.pose_proposer": "PoseProposer ProposerSize",
     "alignment.results": "AlignResult BaseCalibration Calibration PoseStarts",
     "alignment.fit.sigma_schedule": "SigmaSchedule",
-    "alignment.search.skeleton_source": "SpineLimbs",
+    "alignment.skeleton_source": "SpineLimbs",
     "alignment.train_initializer": "TrainingRow TrainInitializerConfig train_initializer",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",
     "capture.depth_frame": "DepthFrame",

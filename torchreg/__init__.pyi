@@ -19,7 +19,7 @@ from torchreg.alignment.results import Calibration as Calibration
 from torchreg.alignment.results import PoseStarts as PoseStarts
 from torchreg.alignment.search.pose_proposer import PoseProposer as PoseProposer
 from torchreg.alignment.search.pose_proposer import ProposerSize as ProposerSize
-from torchreg.alignment.search.skeleton_source import SpineLimbs as SpineLimbs
+from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
 from torchreg.alignment.train_initializer import TrainingRow as TrainingRow
 from torchreg.alignment.train_initializer import TrainInitializerConfig as TrainInitializerConfig
 from torchreg.alignment.train_initializer import train_initializer as train_initializer
