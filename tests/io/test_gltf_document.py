@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import torchreg as tr
 from tests.io.helpers import KINDS, TYPES, refused
-from torchreg.io.gltf_document import GltfDocument, parents_first
+from torchreg.io.gltf_file.document import GltfDocument, parents_first
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 
 FormatError, ModelError = tr.errors.FormatError, tr.errors.ModelError

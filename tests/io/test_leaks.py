@@ -11,10 +11,10 @@ import torch
 import torchreg as tr
 from torchreg.errors import FormatError, TorchregError
 from torchreg.io.calibration import load_depth_camera
-from torchreg.io.gltf_document import GltfDocument
+from torchreg.io.cameras.opencv_yaml import load_opencv
+from torchreg.io.gltf_file.document import GltfDocument
 from torchreg.io.images import load_depth, load_mask
 from torchreg.io.limits import DEFAULT_LIMITS
-from torchreg.io.opencv_yaml import load_opencv
 from torchreg.io.urdf import load_urdf
 from torchreg.storage import load_pose
 

@@ -18,11 +18,11 @@ from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
+from torchreg.io.clouds.npz import read_npy_header
 from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.masks import mask_of_numbers, mask_of_picture
 from torchreg.io.natural_order import last_number, natural_sorted
-from torchreg.io.npz import read_npy_header
 
 Found = TypeVar("Found")
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

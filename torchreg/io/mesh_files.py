@@ -19,10 +19,10 @@ import torch
 
 from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
+from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.clouds.stl import is_binary_stl
 from torchreg.io.file_format import check_stand_in
 from torchreg.io.limits import FileLimits, read_bytes
-from torchreg.io.raw_cloud import Array
-from torchreg.io.stl import is_binary_stl
 from torchreg.io.strict_xml import parse_xml
 
 _PARSER_ERRORS = (

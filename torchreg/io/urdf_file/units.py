@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg.errors import UnitsWarning
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.units import likely_unit
-from torchreg.io.urdf_record import UrdfRecord
+from torchreg.io.urdf_file.record import UrdfRecord
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from torchreg.errors import FormatError
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, parse_table
 from torchreg.io.limits import FileLimits, check_allowed
-from torchreg.io.raw_cloud import Array, RawCloud, parse_table
 
 # Bytes of the title and of the count of facets.
 _HEADER = 84

@@ -10,9 +10,17 @@ from typing import Literal
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.columns import named_columns, stack_named
+from torchreg.io.clouds.columns import named_columns, stack_named
+from torchreg.io.clouds.raw_cloud import (
+    Array,
+    RawCloud,
+    as_indices,
+    as_integers,
+    fan_triangles,
+    parse_table,
+    strip_triangles,
+)
 from torchreg.io.limits import FileLimits, check_allowed
-from torchreg.io.raw_cloud import Array, RawCloud, as_indices, as_integers, fan_triangles, parse_table, strip_triangles
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",

@@ -8,10 +8,10 @@ import warnings
 import numpy as np
 
 from torchreg.errors import FileWarning, FormatError
-from torchreg.io.columns import typed_colors
+from torchreg.io.clouds.columns import typed_colors
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, not_measured, parse_numbers
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_allowed, check_budget
-from torchreg.io.raw_cloud import Array, RawCloud, not_measured, parse_numbers
 
 _NUMBER = rb"[-+.\deE]{1,40}"
 # Columns and rows of the grid, place and axes of the scanner (4 x 3), and its motion (4 x 4).

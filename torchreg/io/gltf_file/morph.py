@@ -13,7 +13,7 @@ from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.upright import Direction, to_y_up
-from torchreg.io.gltf_builder import (
+from torchreg.io.gltf_file.builder import (
     DEFAULT_COLOR,
     Array,
     GltfBuilder,

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.gltf_clip import pose_nodes
-from torchreg.io.gltf_document import GltfDocument, Mode, rotation_matrices, triangles
-from torchreg.io.gltf_primitives import turned_normals
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, as_indices
+from torchreg.io.gltf_file.clip import pose_nodes
+from torchreg.io.gltf_file.document import GltfDocument, Mode, rotation_matrices, triangles
+from torchreg.io.gltf_file.primitives import turned_normals
 from torchreg.io.limits import FileLimits, check_allowed
-from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from torchreg.errors import FileWarning, FormatError, ModelError
-from torchreg.io.gltf_document import GltfDocument, Mode, triangles
+from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.gltf_file.document import GltfDocument, Mode, triangles
 from torchreg.io.limits import FILE_BUDGET, FileLimits
-from torchreg.io.raw_cloud import Array
 
 
 @dataclass(frozen=True)

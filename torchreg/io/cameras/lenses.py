@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchreg.errors import FormatError
-from torchreg.io.raw_cloud import Array
+from torchreg.io.clouds.raw_cloud import Array
 
 LENS_MODELS = ("distortion_model", "model", "camera_model")
 _PINHOLE = (

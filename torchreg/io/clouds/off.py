@@ -8,9 +8,9 @@ import re
 import numpy as np
 
 from torchreg.errors import FormatError
+from torchreg.io.clouds.raw_cloud import RawCloud
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import FileLimits, check_allowed
-from torchreg.io.raw_cloud import RawCloud
 
 _COMMENT = re.compile(rb"#.*")
 _HEADER = re.compile(rb"\s*(ST)?C?N?OFF\s+(\d{1,12})[ \t]+(\d{1,12})\b")

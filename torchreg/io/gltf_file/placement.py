@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchreg.errors import ModelError
-from torchreg.io.gltf_document import GltfDocument
-from torchreg.io.gltf_primitives import warn
-from torchreg.io.gltf_skins import SKIN_TOLERANCES, Skeleton, Skin, ancestors
-from torchreg.io.raw_cloud import Array
+from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.gltf_file.document import GltfDocument
+from torchreg.io.gltf_file.primitives import warn
+from torchreg.io.gltf_file.skins import SKIN_TOLERANCES, Skeleton, Skin, ancestors
 
 
 def place_skins(document: GltfDocument, skeleton: Skeleton) -> None:

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from torchreg.errors import FileWarning, FormatError
-from torchreg.io.columns import are_normals
+from torchreg.io.clouds.columns import are_normals
+from torchreg.io.clouds.npz import FACES, POINTS, array_of, read_npy_header, triangles_of
+from torchreg.io.clouds.raw_cloud import Array, as_indices, not_measured
 from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_allowed, check_budget, open_zip, read_bytes
-from torchreg.io.npz import FACES, POINTS, array_of, read_npy_header, triangles_of
 from torchreg.io.points import PARSER_ERRORS
-from torchreg.io.raw_cloud import Array, as_indices, not_measured
 
 _NUMBERED = re.compile(r"(.*?)_?(\d+)")
 _ARRAY = b"\x93NUMPY"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchreg.errors import FileWarning, FormatError
-from torchreg.io.raw_cloud import Array, RawCloud
+from torchreg.io.clouds.raw_cloud import Array, RawCloud
 
 # What x, y, z, normals and colors are called, without units and punctuation.
 _NAMES: dict[str, tuple[tuple[str, ...], ...]] = {

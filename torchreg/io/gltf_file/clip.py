@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from torchreg.errors import FormatError, InputError
-from torchreg.io.gltf_document import GltfDocument
-from torchreg.io.raw_cloud import Array
+from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.gltf_file.document import GltfDocument
 
 # Change of a track, of numbers of one or more, that is rounding.
 _STILL = 1e-5

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.columns import stack_named
+from torchreg.io.clouds.columns import stack_named
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, as_integers, parse_table
 from torchreg.io.limits import FileLimits, check_allowed, check_expansion
-from torchreg.io.raw_cloud import Array, RawCloud, as_integers, parse_table
 
 _DATA_LINE = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?(\n|$)", re.MULTILINE)
 _KINDS = {"I": "i", "U": "u", "F": "f"}

@@ -14,9 +14,9 @@ from urllib.parse import unquote
 import numpy as np
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.gltf_draco import DracoGeometry
+from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.gltf_file.draco import DracoGeometry
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_budget, read_bytes
-from torchreg.io.raw_cloud import Array
 
 
 class Mode(IntEnum):

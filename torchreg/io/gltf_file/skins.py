@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.gltf_document import GltfDocument, parents_first
-from torchreg.io.gltf_primitives import Surface, VertexBudget, read_surface, warn
+from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.gltf_file.document import GltfDocument, parents_first
+from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface, warn
 from torchreg.io.limits import FILE_BUDGET, FileLimits
-from torchreg.io.raw_cloud import Array
 
 
 @dataclass(frozen=True)

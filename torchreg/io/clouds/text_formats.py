@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchreg.errors import FileWarning, FormatError
-from torchreg.io.columns import cloud_of_columns, have_decimal_commas, names_points, wanted_columns
+from torchreg.io.clouds.columns import cloud_of_columns, have_decimal_commas, names_points, wanted_columns
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, as_indices, fan_triangles, parse_numbers, parse_table
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import FileLimits, check_allowed
-from torchreg.io.raw_cloud import Array, RawCloud, as_indices, fan_triangles, parse_numbers, parse_table
 
 _COMMENT = re.compile(rb"(#|//).*")
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.raw_cloud import Array
+from torchreg.io.clouds.raw_cloud import Array
 
 NAME = "KHR_draco_mesh_compression"
 

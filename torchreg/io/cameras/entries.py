@@ -15,8 +15,8 @@ import torch
 from torchreg.errors import FileWarning, FormatError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.rigid import invert_rigid
-from torchreg.io.camera_lenses import LENS_MODELS, check_lens
-from torchreg.io.raw_cloud import Array
+from torchreg.io.cameras.lenses import LENS_MODELS, check_lens
+from torchreg.io.clouds.raw_cloud import Array
 
 # Other names of our entries: RealSense, Record3D, instant-ngp, ROS, OpenCV, NICE-SLAM.
 _ALIASES = {

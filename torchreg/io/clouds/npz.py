@@ -16,10 +16,10 @@ from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.columns import cloud_of_columns
+from torchreg.io.clouds.columns import cloud_of_columns
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, as_indices, fan_triangles
 from torchreg.io.file_format import naming
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
-from torchreg.io.raw_cloud import Array, RawCloud, as_indices, fan_triangles
 
 # What arrays of points and of faces are called.
 POINTS = ("points", "vertices", "verts", "v")

@@ -20,15 +20,15 @@ from torchreg.errors import FileWarning, InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import rotation_between
 from torchreg.io.atomic import write_atomic
+from torchreg.io.clouds.raw_cloud import Array
 from torchreg.io.file_format import naming
 from torchreg.io.gltf import RigRecord, load_rig
-from torchreg.io.gltf_builder import checked_numbers, checked_path
-from torchreg.io.gltf_document import GltfDocument
-from torchreg.io.gltf_placement import place_skins
-from torchreg.io.gltf_primitives import rig_primitives
-from torchreg.io.gltf_skins import Skeleton, ancestors, read_skeleton
+from torchreg.io.gltf_file.builder import checked_numbers, checked_path
+from torchreg.io.gltf_file.document import GltfDocument
+from torchreg.io.gltf_file.placement import place_skins
+from torchreg.io.gltf_file.primitives import rig_primitives
+from torchreg.io.gltf_file.skins import Skeleton, ancestors, read_skeleton
 from torchreg.io.limits import DEFAULT_LIMITS, local_path, read_bytes
-from torchreg.io.raw_cloud import Array
 
 _IMAGES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 

@@ -6,17 +6,17 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from torchreg.io.clouds.npz import read_npy, read_npz, write_npz
+from torchreg.io.clouds.off import read_off
+from torchreg.io.clouds.pcd import read_pcd, write_pcd
+from torchreg.io.clouds.ply import read_ply, write_ply
+from torchreg.io.clouds.ptx import is_ptx, read_ptx
+from torchreg.io.clouds.raw_cloud import RawCloud
+from torchreg.io.clouds.stl import is_binary_stl, read_stl
+from torchreg.io.clouds.text_formats import looks_like_table, read_obj, read_table, write_csv, write_xyz
 from torchreg.io.file_format import FileFormat, begins, ending_of
-from torchreg.io.glb import read_gltf
+from torchreg.io.gltf_file.glb import read_gltf
 from torchreg.io.limits import FileLimits
-from torchreg.io.npz import read_npy, read_npz, write_npz
-from torchreg.io.off import read_off
-from torchreg.io.pcd import read_pcd, write_pcd
-from torchreg.io.ply import read_ply, write_ply
-from torchreg.io.ptx import is_ptx, read_ptx
-from torchreg.io.raw_cloud import RawCloud
-from torchreg.io.stl import is_binary_stl, read_stl
-from torchreg.io.text_formats import looks_like_table, read_obj, read_table, write_csv, write_xyz
 
 CLOUDS = "point clouds and meshes"
 # Of Wavefront's lines, those that may come before the first vertex.

@@ -20,8 +20,8 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.io.atomic import write_atomic
-from torchreg.io.camera_entries import MATRICES, cameras_of
-from torchreg.io.camera_lenses import check_lens
+from torchreg.io.cameras.entries import MATRICES, cameras_of
+from torchreg.io.cameras.lenses import check_lens
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
