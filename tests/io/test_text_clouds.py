@@ -154,9 +154,10 @@ def test_columns_four_to_six_are_colors_normals_or_left_out(tmp_path):
     assert cloud.normals is None
     np.testing.assert_allclose(cloud.colors, fractions)
     assert read(tmp_path, "b.xyz", rows(POINTS, NORMALS)).colors is None
-    with pytest.warns(FileWarning, match=r"a\.xyz: columns 4 to 6 are left out: numbers from -.* to .* are neither"):
-        cloud = read(tmp_path, "a.xyz", rows(POINTS, 900 * POINTS))
-    assert (cloud.normals, cloud.colors) == (None, None)
+    for others in (900 * POINTS, 200 * fractions + 0.001, 70000 + np.arange(150).reshape(50, 3)):
+        with pytest.warns(FileWarning, match=r"a\.xyz: columns 4 to 6 are left out: numbers from .* to .* are neither"):
+            cloud = read(tmp_path, "a.xyz", rows(POINTS, others))
+        assert (cloud.normals, cloud.colors) == (None, None)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

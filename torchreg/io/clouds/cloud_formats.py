@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from torchreg.io.clouds.npz import read_npy, read_npz, write_npz
+from torchreg.io.clouds.npz import ARCHIVE_START, ARRAY_START, read_npy, read_npz, write_npz
 from torchreg.io.clouds.off import read_off
 from torchreg.io.clouds.pcd import read_pcd, write_pcd
 from torchreg.io.clouds.ply import read_ply, write_ply
@@ -155,7 +155,7 @@ FORMATS: tuple[FileFormat, ...] = (
         read=_from_content(read_npz),
         holds="points (or vertices, verts, v), normals, colors, faces (or f)",
         loader="load_points",
-        sniff=begins(b"PK\x03\x04"),
+        sniff=begins(ARCHIVE_START),
         write=write_npz,
         written=("normals", "colors", "faces"),
     ),
@@ -166,7 +166,7 @@ FORMATS: tuple[FileFormat, ...] = (
         read=_from_content(read_npy),
         holds="(N, 3) or more columns, (H, W, 3), fields x y z",
         loader="load_points",
-        sniff=begins(b"\x93NUMPY"),
+        sniff=begins(ARRAY_START),
     ),
 )
 ENDINGS = tuple(ending for row in FORMATS for ending in row.endings)

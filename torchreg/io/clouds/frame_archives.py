@@ -13,14 +13,13 @@ import numpy as np
 
 from torchreg.errors import FileWarning, FormatError
 from torchreg.io.clouds.columns import are_normals
-from torchreg.io.clouds.npz import FACES, POINTS, array_of, read_npy_header, triangles_of
+from torchreg.io.clouds.npz import ARCHIVE_START, ARRAY_START, FACES, POINTS, array_of, read_npy_header, triangles_of
 from torchreg.io.clouds.raw_cloud import Array, as_indices, not_measured
 from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_allowed, check_budget, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
 
 _NUMBERED = re.compile(r"(.*?)_?(\d+)")
-_ARRAY = b"\x93NUMPY"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +35,22 @@ class FrameArchive:
     faces: Array | None = None
 
 
+def may_be_archive(file: Path) -> bool:
+    """Return whether a file is an array or an archive by its first bytes, or is called one."""
+    if file.suffix.lower() in (".npz", ".npy"):
+        return True
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(8).startswith((ARRAY_START, ARCHIVE_START))
+
+
 def read_frame_archive(file: Path, limits: FileLimits) -> FrameArchive | None:
     """Return the frames of an archive, None if it does not hold frames."""
     content = read_bytes(file, limits)
     with naming(file):
         try:
-            if content.startswith(_ARRAY):
+            if content.startswith(ARRAY_START):
                 found = _frames_of(content)
             else:
                 check_stand_in(content)

@@ -21,6 +21,8 @@ from torchreg.io.clouds.raw_cloud import Array, RawCloud, as_indices, fan_triang
 from torchreg.io.file_format import naming
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
 
+# First bytes of an array, and of an archive of arrays.
+ARRAY_START, ARCHIVE_START = b"\x93NUMPY", b"PK\x03\x04"
 # What arrays of points and of faces are called.
 POINTS = ("points", "vertices", "verts", "v")
 FACES = ("faces", "f", "triangles")
@@ -130,7 +132,7 @@ _MAX_HEADER = 10_000
 def read_npy_header(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Return shape, Fortran order and dtype of an array, and leave the stream at its numbers."""
     head = stream.read(8)
-    if len(head) < 8 or head[:6] != b"\x93NUMPY":
+    if len(head) < 8 or head[:6] != ARRAY_START:
         raise FormatError(f"{what} is no .npy file (it does not begin like one)")
     if (head[6], head[7]) not in _LENGTHS:
         raise FormatError(f"{what} has the unknown array format {head[6], head[7]}")

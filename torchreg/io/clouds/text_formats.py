@@ -41,7 +41,7 @@ def read_table(content: bytes, limits: FileLimits, *, intensity_first: bool = Fa
             claimed = int(words[0][:20])
         elif not headed and (_is_header(line) or _numbers_columns(line, text)):
             headed = True
-            names = [word.decode("utf-8", "replace").strip("\"'") for word in words]
+            names = _names(line)
         else:
             break
         end = text.index(line) + len(line)
@@ -74,12 +74,14 @@ def _numbers(text: bytes, names: list[str] | None, before: int) -> Array:
 
 
 def looks_like_table(content: bytes) -> bool:
-    """Return whether the first lines of a text are rows of three numbers or more, below a line of names at most."""
+    """Return whether the first lines of a text are rows of three numbers or more, below names or a count at most."""
     head = plain_text(content[:4096]).replace(b"\r", b"\n")
+    if b"\0" in head:  # binary numbers, between which bytes may look like separators
+        return False
     lines = [line for line in _COMMENT.sub(b"", head).split(b"\n")[:-1] or [head] if line.strip()]
-    lines = [
-        line for number, line in enumerate(lines[:5]) if number or not (_is_header(line) or line.strip().isdigit())
-    ]
+    if lines and (lines[0].strip().isdigit() or names_points(_names(lines[0]))):
+        del lines[0]
+    lines = lines[:4]
     return bool(lines) and all(len(_words(line)) >= 3 and not _is_header(line) for line in lines)
 
 
@@ -95,6 +97,11 @@ def _words(line: bytes) -> list[bytes]:
         if separator in line:
             return [word.strip() for word in line.strip().rstrip(separator).split(separator)]
     return line.split()
+
+
+def _names(line: bytes) -> list[str]:
+    """Return the fields of a line as names of columns."""
+    return [word.decode("utf-8", "replace").strip("\"'") for word in _words(line)]
 
 
 def _is_header(line: bytes) -> bool:
@@ -117,7 +124,7 @@ def _names_in_comment(text: bytes) -> list[str] | None:
     line = _first_line(text).strip()
     if not line.startswith((b"#", b"//")):
         return None
-    names = [word.decode("utf-8", "replace") for word in _words(line.lstrip(b"#/ "))]
+    names = _names(line.lstrip(b"#/ "))
     return names if names_points(names) else None
 
 
