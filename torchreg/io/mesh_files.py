@@ -45,13 +45,7 @@ class MeshFiles:
         self._cache: dict[Path, TriangleMesh] = {}
 
     def read(self, filename: str, what: str) -> TriangleMesh | None:
-        """Return the triangles of a mesh file, float64; None if it cannot be read and is not required.
-
-        Args:
-            filename: relative to the folder of the description or one above, or ``file://``, ``package://``,
-                ``model://``; backslashes are slashes.
-            what: the name of the mesh in messages.
-        """
+        """Return the triangles of a mesh by path or address, float64; None if it is not there nor required."""
         tried = self._candidates(filename.replace("\\", "/"))
         found = next((file for path in tried if (file := _found(path)) is not None), None)
         if found is None:

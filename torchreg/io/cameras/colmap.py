@@ -33,13 +33,6 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
     """Return the cameras of a COLMAP text model, one per image and named after it, in the order of ``images.txt``.
 
     Lengths keep COLMAP's unit, which is arbitrary unless the model was scaled to metres.
-
-    Args:
-        folder: holds ``cameras.txt`` and ``images.txt``.
-        limits: ``max_bytes`` applies to each.
-
-    Returns:
-        The cameras, float64.
     """
     directory = local_path(folder)
     lenses = _lenses(directory / "cameras.txt", limits)
@@ -56,12 +49,7 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
 
 
 def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
-    """Write ``cameras.txt`` and ``images.txt``: one lens per camera and an image of its name without points.
-
-    Args:
-        folder: must exist.
-        cameras: their names must not hold blanks.
-    """
+    """Write ``cameras.txt`` and ``images.txt``: a lens per camera and an image of its name, which holds no blanks."""
     directory = local_path(folder)
     lenses = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as (X Y POINT3D_ID)"]

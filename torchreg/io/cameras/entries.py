@@ -66,10 +66,6 @@ def own_entry(given: Mapping[str, Any], where: str) -> dict[str, Any]:
 
     Known are Open3D's intrinsics and parameters (also those of its Azure Kinect and RealSense recorders), RealSense's
     own, Polycam's, Record3D's, instant-ngp's, Replica's and ORB-SLAM's, ROS's camera_info, and K and D as lists.
-
-    Args:
-        given: a JSON or YAML object.
-        where: it is from, for messages.
     """
     given = _flat(given)
     entry = {name: given[name] for name in OWN if name in given}
@@ -102,11 +98,7 @@ def _flat(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def depth_unit(given: Mapping[str, Any], where: str) -> float | None:
-    """Return the metres per unit of depth images that a camera's object tells, under any name; None if it does not.
-
-    Warns:
-        FileWarning: if a number can only be the inverse of what its name says.
-    """
+    """Return the metres per unit of depth images that a camera's object states, under any name; None if it does not."""
     given = _flat(given)
     units = {name: _metres(given, name, where) for name in _DEPTHS if name in given}
     # Beside depths a scale is one of the picture.

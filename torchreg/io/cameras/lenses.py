@@ -25,14 +25,7 @@ _UNSET = ("", "0", "0.0", "false", "no", "none")
 
 
 def check_lens(given: Mapping[str, Any], numbers: Array, where: str, focal: float | None = None) -> None:
-    """Raise FormatError if a lens's numbers have another meaning than OpenCV's for a pinhole camera.
-
-    Args:
-        given: the entries beside them, some of which may name the kind of lens.
-        numbers: (N,).
-        where: they are from, for messages.
-        focal: the focal length in widths of the picture, where four numbers without a name may be a fisheye's.
-    """
+    """Raise FormatError if numbers (N,) are not OpenCV's for a pinhole lens; ``focal`` is in widths of the picture."""
     model = next((str(given[name]) for name in LENS_MODELS if isinstance(given.get(name), str)), "")
     known = _plain(model) in _PINHOLE or not numbers.any()
     other = _other_lens(given)

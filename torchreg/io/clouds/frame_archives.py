@@ -24,15 +24,10 @@ _NUMBERED = re.compile(r"(.*?)_?(\d+)")
 
 @dataclass(frozen=True, eq=False)
 class FrameArchive:
-    """The frames of an archive.
+    """The frames of an archive."""
 
-    Args:
-        rows: per frame (M, 3).
-        faces: (F, 3) of all frames, which are then meshes; None for clouds.
-    """
-
-    rows: list[Array]
-    faces: Array | None = None
+    rows: list[Array]  # per frame (M, 3)
+    faces: Array | None = None  # (F, 3) of all frames, which are then meshes; None for clouds
 
 
 def may_be_archive(file: Path) -> bool:

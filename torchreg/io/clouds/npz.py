@@ -173,13 +173,7 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
 def load_arrays(
     path: str | os.PathLike[str], names: Sequence[str], *, limits: FileLimits = DEFAULT_LIMITS
 ) -> dict[str, Tensor]:
-    """Return arrays of real numbers by name from an .npz file; all others in it are left alone.
-
-    Args:
-        path: a local file ending in .npz.
-        names: of the arrays.
-        limits: on the size of the file.
-    """
+    """Return arrays of real numbers by name from an .npz file; all others in it are left alone."""
     file = local_path(path)
     content = read_bytes(file, limits)
     with naming(path), open_zip(content, limits) as archive:
@@ -205,12 +199,7 @@ def write_npz(cloud: RawCloud) -> bytes:
 
 
 def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Tensor]) -> None:
-    """Write tensors under their names to an archive that numpy reads.
-
-    Args:
-        path: a local file ending in .npz; an existing one is replaced, whole or not at all.
-        arrays: name to tensor.
-    """
+    """Write tensors under their names to an .npz archive that numpy reads, whole or not at all."""
     file = local_path(path)
     if file.suffix.lower() != ".npz":
         raise InputError(f"path must end in .npz, got {file.name!r}; rename the output file")

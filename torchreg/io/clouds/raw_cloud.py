@@ -20,19 +20,12 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class RawCloud:
-    """Arrays of one file.
+    """Arrays of one file."""
 
-    Args:
-        points: (N, 3) floating point, in the precision of the file.
-        normals: (N, 3) or None.
-        colors: (N, 3), integers over their full range or floats from 0 to 1, or None.
-        faces: (F, 3) int64, 0-based, or None.
-    """
-
-    points: Array
-    normals: Array | None = None
-    colors: Array | None = None
-    faces: Array | None = None
+    points: Array  # (N, 3) floating point, in the precision of the file
+    normals: Array | None = None  # (N, 3) or None
+    colors: Array | None = None  # (N, 3), integers over their full range or floats from 0 to 1, or None
+    faces: Array | None = None  # (F, 3) int64, 0-based, or None
 
 
 def not_measured(missing: int, count: int, where: str = "") -> str:
@@ -41,13 +34,7 @@ def not_measured(missing: int, count: int, where: str = "") -> str:
 
 
 def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array:
-    """Return lines of numbers as a float64 (rows, columns) table.
-
-    Args:
-        lines: non-blank lines.
-        columns: numbers per line; None takes the number of the first line.
-        what: name of a row, for messages.
-    """
+    """Return lines of numbers as a float64 (rows, columns) table, by default as wide as the first line."""
     if not lines:
         return np.zeros((0, columns or 0))
     if not all(line.strip() for line in lines):
@@ -56,15 +43,7 @@ def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array
 
 
 def parse_numbers(text: bytes, columns: int | None, what: str, *, unit: str = "line", before: int = 0) -> Array:
-    """Return the numbers of a text as a float64 (rows, columns) table; blank lines are passed over.
-
-    Args:
-        text: numbers separated by blanks, one row a line.
-        columns: numbers per line; None takes the number of the first line.
-        what: name of a row, for messages.
-        unit: name of a line, for messages.
-        before: lines of the file before the text.
-    """
+    """Return the numbers of a text, one row a line, as a float64 (rows, columns) table; blank lines are passed over."""
     counts = _counts(text)
     rows = counts.nonzero()[0]
     if not len(rows):
@@ -143,14 +122,7 @@ _POLYGONS = 4096
 
 
 def fan_triangles(counts: Array, indices: Array) -> Array:
-    """Return the (F, 3) triangles of polygons, each cut as a fan from its first corner.
-
-    Polygons of fewer than three corners are left out, with a warning that counts them.
-
-    Args:
-        counts: (P,) corners of each polygon, int64.
-        indices: (sum of counts,) vertex indices of all polygons, one after the other.
-    """
+    """Return the (F, 3) triangles of polygons of ``counts`` (P,) corners, cut as fans; warn of those of under 3."""
     small = int(np.count_nonzero(counts < 3))
     if small:
         warnings.warn(
@@ -167,12 +139,7 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
 
 
 def strip_triangles(counts: Array, indices: Array) -> Array:
-    """Return the (F, 3) triangles of strips, all of the side of their strip's first; flat ones join strips, and go.
-
-    Args:
-        counts: (S,) entries of each list of strips, int64.
-        indices: (sum of counts,) vertex indices of all lists, one after the other; -1 begins a new strip.
-    """
+    """Return the (F, 3) triangles of lists of ``counts`` (S,) entries, where -1 begins a strip; flat ones go."""
     number = np.arange(len(indices))
     begins = np.isin(number, np.cumsum(counts) - counts)
     begins[1:] |= indices[:-1] < 0

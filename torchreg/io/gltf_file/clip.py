@@ -16,13 +16,7 @@ _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 
 
 def pose_nodes(document: GltfDocument, time: float | None, frame: int | None) -> None:
-    """Put the nodes of a document where its first animation has them.
-
-    Args:
-        document: whose nodes are changed in place.
-        time: seconds, held inside the clip; None leaves the pose at rest unless ``frame`` is given.
-        frame: number of the keyframe, from zero; -1 is the last.
-    """
+    """Put nodes, in place, where the first animation has them at a time, seconds, or at a keyframe; -1 is the last."""
     if time is None and frame is None:
         return
     if time is not None and frame is not None:

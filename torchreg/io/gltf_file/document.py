@@ -45,11 +45,6 @@ class GltfDocument:
     """The JSON and the buffers of a glTF file, with every index, size and number checked when it is used.
 
     Errors do not name the file; callers add it.
-
-    Args:
-        content: bytes of the .glb or .gltf file.
-        path: of the file; separate buffers must lie in its folder or below.
-        limits: ``max_bytes`` applies to each buffer and each accessor.
     """
 
     def __init__(self, content: bytes, path: Path, limits: FileLimits) -> None:
@@ -122,13 +117,7 @@ class GltfDocument:
         return count
 
     def accessor(self, index: Any, what: str | None = None, types: Sequence[str] = tuple(_WIDTHS)) -> Array:
-        """Return an accessor as (count, width) in its own type, normalized integers as float64.
-
-        Args:
-            index: of the accessor.
-            what: the accessor holds, for messages.
-            types: names such as "VEC3", of which its type must be one.
-        """
+        """Return an accessor of one of ``types`` as (count, width), normalized integers as float64."""
         count = self.accessor_count(index, what)
         item = self.item("accessors", index)
         what = what or f"accessors[{index}] of {count} elements"
@@ -379,13 +368,7 @@ def rotation_matrices(quaternions: Array) -> Array:
 
 
 def triangles(mode: int, corners: Array, what: str) -> Array:
-    """Return the (F, 3) triangles of a primitive, none where ``mode`` draws points or lines.
-
-    Args:
-        mode: a `Mode` or another number of glTF.
-        corners: (C,) int64 vertices in the order of the file.
-        what: they are of, for messages.
-    """
+    """Return the (F, 3) triangles of vertices ``corners`` (C,), none where ``mode`` draws points or lines."""
     if mode == Mode.TRIANGLES:
         if len(corners) % 3:
             raise FormatError(f"{what} has {len(corners)} triangle corners, not a multiple of three: it is damaged")

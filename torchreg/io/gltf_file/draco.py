@@ -37,11 +37,7 @@ class _Source:
 
 
 class DracoGeometry:
-    """The compressed primitives of a document, each unpacked once, when it is asked for.
-
-    Args:
-        document: they are of.
-    """
+    """The compressed primitives of a document, each unpacked once, when it is asked for."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -67,13 +63,7 @@ class DracoGeometry:
         return found
 
     def numbers(self, accessor: int, what: str, shape: tuple[int, int]) -> Array | None:
-        """Return the numbers of an accessor, None where it is not compressed.
-
-        Args:
-            accessor: its number.
-            what: it holds, for messages.
-            shape: (N, W) that it claims.
-        """
+        """Return the numbers of an accessor that claims the shape (N, W), None where it is not compressed."""
         source = self._sources.get(accessor)
         if source is None:
             return None

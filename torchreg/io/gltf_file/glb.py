@@ -19,19 +19,12 @@ from torchreg.io.limits import FileLimits, check_allowed
 
 @dataclass(frozen=True)
 class _Instance:
-    """A mesh where it is shown.
+    """A mesh where it is shown."""
 
-    Args:
-        mesh: entry of the document.
-        transform: (4, 4) of its node to the scene, unused where a skin moves it.
-        skin: matrices (J, 4, 4) of the joints, from the mesh to the scene; None for plain meshes.
-        weights: of the morph targets; None for those of the mesh.
-    """
-
-    mesh: dict[str, Any]
-    transform: Array
-    skin: Array | None = None
-    weights: list[float] | None = None
+    mesh: dict[str, Any]  # entry of the document
+    transform: Array  # (4, 4) of its node to the scene, unused where a skin moves it
+    skin: Array | None = None  # matrices (J, 4, 4) of the joints, from the mesh to the scene; None for plain meshes
+    weights: list[float] | None = None  # of the morph targets; None for those of the mesh
 
 
 def read_gltf(
@@ -42,13 +35,6 @@ def read_gltf(
     Everything stands as viewers show it: node transforms, skins in the pose of their joints, morph targets at their
     weights, instances. Meshes appear in the order of the node tree, vertices in the order of the file. Lines and
     materials are ignored.
-
-    Args:
-        content: of the file.
-        path: of the file, for buffers beside it.
-        limits: see `FileLimits`.
-        time: seconds of the first animation at which things are shown; None for the pose at rest.
-        frame: number of the keyframe of the first animation, instead of ``time``.
     """
     document = GltfDocument(content, path, limits)
     if not str(document.entry(document.json, "asset", dict).get("version")).startswith("2"):

@@ -17,19 +17,12 @@ from torchreg.io.limits import FILE_BUDGET, FileLimits, check_budget
 
 @dataclass(frozen=True)
 class RigidParts:
-    """Rigid meshes on a tree of nodes.
+    """Rigid meshes on a tree of nodes."""
 
-    Args:
-        skeleton: of the joints.
-        surfaces: of the parts at rest, each vertex of weight one.
-        slides: names of the joints that a clip slides.
-        fixed: names of the joints that nothing turns.
-    """
-
-    skeleton: Skeleton
-    surfaces: list[Surface]
-    slides: tuple[str, ...]
-    fixed: tuple[str, ...]
+    skeleton: Skeleton  # of the joints
+    surfaces: list[Surface]  # of the parts at rest, each vertex of weight one
+    slides: tuple[str, ...]  # names of the joints that a clip slides
+    fixed: tuple[str, ...]  # names of the joints that nothing turns
 
 
 def read_parts(document: GltfDocument, name: str, limits: FileLimits) -> RigidParts:
@@ -37,11 +30,6 @@ def read_parts(document: GltfDocument, name: str, limits: FileLimits) -> RigidPa
 
     The joints are the nodes that a clip moves, with all meshes below them; where no clip moves any mesh, all nodes with
     a mesh, if one hangs on another. What hangs on none of them is the base, as are those that move side by side.
-
-    Args:
-        document: of the file.
-        name: of the base, where it is no node.
-        limits: on files.
     """
     parents = document.node_parents()
     shown = sorted(shown_nodes(document))

@@ -131,15 +131,7 @@ def _top(skin: Skin, skeleton: Skeleton) -> int:
 
 
 def _nearest(usual: list[Array], turns: list[Array], top: Array, mean: Array, scale: float) -> Array:
-    """Return the place that is meant by a skeleton that the nodes pose.
-
-    Args:
-        usual: places by the node above and as stored.
-        turns: all by quarters.
-        top: (4, 4) motion of the topmost joint, without scale.
-        mean: (4, 4) of all joints.
-        scale: of the places.
-    """
+    """Return the place meant by the motions (4, 4) of the topmost joint, without scale, and of all joints."""
     every = [*usual, *turns]
     for place in every:
         if np.abs(place / scale - top)[:3, :3].max() <= SKIN_TOLERANCES.equal:

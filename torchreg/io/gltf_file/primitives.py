@@ -18,19 +18,12 @@ from torchreg.io.limits import FILE_BUDGET, FileLimits
 
 @dataclass(frozen=True)
 class RigPrimitive:
-    """A primitive of a mesh.
+    """A primitive of a mesh."""
 
-    Args:
-        entry: of the document.
-        attributes: of the entry.
-        mode: see `Mode`.
-        what: it is, for messages.
-    """
-
-    entry: dict[str, Any]
-    attributes: dict[str, Any]
-    mode: int
-    what: str
+    entry: dict[str, Any]  # of the document
+    attributes: dict[str, Any]  # of the entry
+    mode: int  # see `Mode`
+    what: str  # it is, for messages
 
     @property
     def key(self) -> str:
@@ -68,21 +61,13 @@ class Surface:
 
 @dataclass
 class VertexBudget:
-    """How many vertices and weights of a rig are read, and have been read.
+    """How many vertices and weights of a rig are read, and have been read."""
 
-    Args:
-        document: of the rig.
-        limits: on files.
-        joints: of the rig.
-        vertices: read so far.
-        left_out: primitives that lack something, so far.
-    """
-
-    document: GltfDocument
-    limits: FileLimits
-    joints: int
-    vertices: int = 0
-    left_out: list[str] = field(default_factory=list)
+    document: GltfDocument  # of the rig
+    limits: FileLimits  # on files
+    joints: int  # of the rig
+    vertices: int = 0  # read so far
+    left_out: list[str] = field(default_factory=list)  # primitives that lack something, so far
 
     def add(self, count: int) -> None:
         """Count vertices that are about to be read; FormatError if they are too many."""
@@ -113,13 +98,7 @@ def numbers(document: GltfDocument, index: Any, what: str, shape: str) -> Array:
 
 
 def read_surface(budget: VertexBudget, meshes: Sequence[int], num_joints: int) -> Surface | None:
-    """Return the triangles of meshes; None, with a warning, where there are none.
-
-    Args:
-        budget: of the rig.
-        meshes: their numbers.
-        num_joints: of the skin that moves them; 0 for meshes without one.
-    """
+    """Return the triangles of meshes under a skin of 0 or more joints; None, with a warning, where there are none."""
     document = budget.document
     blocks: list[tuple[Array, Array | None, Array]] = []
     faces: list[Array] = []

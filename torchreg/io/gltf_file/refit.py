@@ -247,14 +247,7 @@ def _replace_bones(output: _Rewriter, skeleton: Skeleton, rig: RigRecord, positi
 
 
 def _stretches(document: GltfDocument, skeleton: Skeleton, rig: RigRecord, positions: Array) -> dict[int, _Stretch]:
-    """Return how translations change, by node: of joints, and of nodes between a joint and its parent.
-
-    Args:
-        document: of the rig.
-        skeleton: of the file.
-        rig: that of the file.
-        positions: (J, 3) new ones in the bind pose, metres.
-    """
+    """Return how translations change, by node, with joints at ``positions`` (J, 3), metres, in the bind pose."""
     node_parents, old = document.node_parents(), rig.joint_transforms[:, :3, 3].numpy()
     world, number = document.node_globals(node_parents), skeleton.number
     root = rig.parents.index(-1)
@@ -317,17 +310,11 @@ def _stretch_clips(output: _Rewriter, stretches: Mapping[int, _Stretch]) -> None
 
 @dataclass(frozen=True)
 class _Track:
-    """What moves a node in a clip.
+    """What moves a node in a clip."""
 
-    Args:
-        samplers: of the clip.
-        channel: of the clip.
-        stretch: of the node.
-    """
-
-    samplers: list[dict[str, Any]]
-    channel: dict[str, Any]
-    stretch: _Stretch
+    samplers: list[dict[str, Any]]  # of the clip
+    channel: dict[str, Any]  # of the clip
+    stretch: _Stretch  # of the node
 
     @property
     def _is_cubic(self) -> bool:

@@ -31,27 +31,16 @@ SKIN_TOLERANCES = _SkinTolerances()
 
 @dataclass
 class Skin:
-    """A skin of a file and what it moves.
+    """A skin of a file and what it moves."""
 
-    Args:
-        index: of the skin.
-        meshes: that it moves.
-        nodes: of its joints.
-        joints: (Js,) numbers of its joints in the skeleton.
-        surface: of the meshes as stored, with weights of the skin's own joints.
-        bind: (Js, 4, 4) the joints as stored.
-        to_scene: (4, 4) where the bind pose stands.
-        is_bent: whether no motion as a whole takes its bind pose to that of the other skins.
-    """
-
-    index: int
-    meshes: list[int]
-    nodes: list[int]
-    joints: Array
-    surface: Surface
-    bind: Array
-    to_scene: Array = field(default_factory=lambda: np.eye(4))
-    is_bent: bool = False
+    index: int  # of the skin
+    meshes: list[int]  # that it moves
+    nodes: list[int]  # of its joints
+    joints: Array  # (Js,) numbers of its joints in the skeleton
+    surface: Surface  # of the meshes as stored, with weights of the skin's own joints
+    bind: Array  # (Js, 4, 4) the joints as stored
+    to_scene: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) where the bind pose stands
+    is_bent: bool = False  # whether no motion as a whole takes its bind pose to that of the other skins
 
     @property
     def used(self) -> Array:
@@ -65,27 +54,16 @@ class Skin:
 
 @dataclass
 class Skeleton:
-    """The joints of all skins that are read together.
+    """The joints of all skins that are read together."""
 
-    Args:
-        nodes: of the joints.
-        names: different ones.
-        parents: numbers of parent joints, -1 for roots.
-        number: of the joint by node; several nodes of equal joints may have one number.
-        world: (J, 4, 4) of the node hierarchy.
-        places: (J, 4, 4) in the pose of all zeros, with the scales of the vertices.
-        skins: that move its vertices.
-        is_baked: whether the pose of all zeros is that of the node hierarchy, as scales differ.
-    """
-
-    nodes: list[int]
-    names: list[str]
-    parents: tuple[int, ...]
-    number: dict[int, int]
-    world: Array
-    places: Array
-    skins: list[Skin]
-    is_baked: bool = False
+    nodes: list[int]  # of the joints
+    names: list[str]  # different ones
+    parents: tuple[int, ...]  # numbers of parent joints, -1 for roots
+    number: dict[int, int]  # of the joint by node; several nodes of equal joints may have one number
+    world: Array  # (J, 4, 4) of the node hierarchy
+    places: Array  # (J, 4, 4) in the pose of all zeros, with the scales of the vertices
+    skins: list[Skin]  # that move its vertices
+    is_baked: bool = False  # whether the pose of all zeros is that of the node hierarchy, as scales differ
 
     def placed_surface(self, skin: Skin) -> Surface:
         """Return the surface of a skin in the pose of all zeros, with weights of all joints."""
@@ -105,15 +83,7 @@ def read_skeleton(
     parents: Mapping[str, str | None],
     limits: FileLimits,
 ) -> tuple[Skeleton, VertexBudget] | None:
-    """Return the joints and the skins of a file, not placed yet; None where no node carries mesh and skin.
-
-    Args:
-        document: of the file.
-        mesh: name or index of the one mesh to read.
-        skin: name or index of the one skin to read.
-        parents: parent joint by joint name, see `load_rig`.
-        limits: on files.
-    """
+    """Return the joints and the skins of a file, not placed yet; None where no node carries mesh and skin."""
     meshes = _choose_skins(document, mesh, skin)
     if not meshes:
         return None
