@@ -18,7 +18,7 @@ from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
-from torchreg.io.clouds.npz import ARRAY_START, read_npy_header
+from torchreg.io.clouds.npz import ARRAY_START, array_of, read_npy_header
 from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.masks import mask_of_numbers, mask_of_picture
@@ -278,15 +278,8 @@ def _decoded_depth(content: bytes, file: Path) -> Any:
 
 def _read_npy(content: bytes, file: Path) -> Any:
     """Return the array (H, W) of a ``.npy`` file."""
-    stream = io.BytesIO(content)
-    shape, fortran, dtype = read_npy_header(stream, f"{file}:")
-    _check_pixels(shape, file)
-    if dtype.kind not in "biuf":
-        raise FormatError(f"{file}: must hold truth values or real numbers, got {dtype}; objects are never loaded")
-    start = stream.tell()
-    if len(content) - start != shape[0] * shape[1] * dtype.itemsize:
-        raise FormatError(f"{file}: holds {len(content) - start} bytes, not {shape} numbers of {dtype}: cut off?")
-    return np.frombuffer(content, dtype, offset=start).reshape(shape, order="F" if fortran else "C")
+    _check_pixels(read_npy_header(io.BytesIO(content), f"{file}:", "biuf")[0], file)
+    return array_of(content, f"{file}:", "biuf")
 
 
 def _read_exr(content: bytes, file: Path) -> Any:

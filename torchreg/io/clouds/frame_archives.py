@@ -175,15 +175,4 @@ def _shape_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[int, ...
 
 
 def _array(archive: zipfile.ZipFile, key: str, kinds: str) -> Array:
-    with archive.open(f"{key}.npy") as stream:
-        try:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-        except ValueError as error:  # objects among others
-            raise FormatError(
-                f"array {key!r} must hold numbers, and pickled objects are never loaded ({error})"
-            ) from error
-    if array.dtype.kind not in kinds:
-        raise FormatError(
-            f"array {key!r} must hold {'truth values' if 'b' in kinds else 'real numbers'}, got {array.dtype}"
-        )
-    return array
+    return array_of(archive.read(f"{key}.npy"), f"array {key!r}", kinds)

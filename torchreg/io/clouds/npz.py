@@ -61,12 +61,10 @@ def _with_columns(rows: Array) -> RawCloud:
     return cloud_of_columns(rows.astype(np.float64))
 
 
-def array_of(content: bytes, what: str) -> Array:
-    """Return the array in the bytes of a .npy file: real numbers, or a structured array of them."""
+def array_of(content: bytes, what: str, kinds: str = "iufbV") -> Array:
+    """Return the array in the bytes of a .npy file, of one of some kinds of dtype; structured ones are V."""
     stream = io.BytesIO(content)
-    shape, fortran, dtype = read_npy_header(stream, what)
-    if dtype.hasobject or (dtype.names is None and dtype.kind not in "iufb"):
-        raise FormatError(f"{what} must hold real numbers, got {dtype}; pickled objects are never loaded")
+    shape, fortran, dtype = read_npy_header(stream, what, kinds)
     held = len(content) - stream.tell()
     if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held:
         raise FormatError(
@@ -87,7 +85,7 @@ def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
         key = named[0] if named else _only_points(archive, names)
         corners = next((name for name in FACES if name in names), "faces")
         wanted = [name for name in (key, "normals", "colors", corners) if name in names]
-        arrays = {name: _read_array(archive, names[name]) for name in wanted}
+        arrays = {name: _member(archive, names[name]) for name in wanted}
     points = arrays[key]
     check_allowed(len(points) if points.ndim else 0, "points", limits)
     if points.ndim == 3 and points.shape[2] == 3:
@@ -113,7 +111,7 @@ def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:
     found = []
     for key, name in names.items():
         with archive.open(name) as stream:
-            shape, _, dtype = _read_real_header(stream, name)
+            shape, _, dtype = read_npy_header(stream, f"member {name!r}", "iuf")
         if len(shape) == 2 and shape[1] == 3 and dtype.kind == "f":
             found.append(key)
     if len(found) != 1:
@@ -129,8 +127,8 @@ _LENGTHS = {(1, 0): 2, (2, 0): 4}
 _MAX_HEADER = 10_000
 
 
-def read_npy_header(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return shape, Fortran order and dtype of an array, and leave the stream at its numbers."""
+def read_npy_header(stream: IO[bytes], what: str, kinds: str = "") -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, Fortran order and dtype, of one of some kinds if any, and leave the stream at the numbers."""
     head = stream.read(8)
     if len(head) < 8 or head[:6] != ARRAY_START:
         raise FormatError(f"{what} is no .npy file (it does not begin like one)")
@@ -147,27 +145,17 @@ def read_npy_header(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool
             raise ValueError(f"its shape is {shape!r:.80}")
         if not isinstance(fortran, bool) or not isinstance(kind, (str, list)):
             raise ValueError(f"its numbers are {kind!r:.80}")
-        return shape, fortran, np.dtype([tuple(field) for field in kind] if isinstance(kind, list) else kind)
+        dtype = np.dtype([tuple(field) for field in kind] if isinstance(kind, list) else kind)
     except (ValueError, TypeError, LookupError, SyntaxError, RecursionError, MemoryError) as error:
         raise FormatError(f"{what} is no .npy file ({error})") from error
-
-
-def _read_real_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return the header of a member that holds real numbers."""
-    shape, fortran, dtype = read_npy_header(stream, f"member {name!r}")
-    if dtype.hasobject or dtype.kind not in "iuf":
-        raise FormatError(f"member {name!r} must hold real numbers, got {dtype}; pickled objects are never loaded")
+    if kinds and (dtype.hasobject or dtype.kind not in kinds or (dtype.kind == "V" and dtype.names is None)):
+        wanted = "real numbers" if "f" in kinds else "truth values"
+        raise FormatError(f"{what} must hold {wanted}, got {dtype}; pickled objects are never loaded")
     return shape, fortran, dtype
 
 
-def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
-    content = archive.read(name)
-    stream = io.BytesIO(content)
-    shape, fortran, dtype = _read_real_header(stream, name)
-    held = len(content) - stream.tell()
-    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held:
-        raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {held} bytes")
-    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
+def _member(archive: zipfile.ZipFile, name: str) -> Array:
+    return array_of(archive.read(name), f"member {name!r}", "iuf")
 
 
 def load_arrays(
@@ -181,7 +169,7 @@ def load_arrays(
         lacking = [name for name in names if name not in held]
         if lacking:
             raise FormatError(f"lacks the array {lacking[0]!r}; it holds {', '.join(sorted(held)[:12]) or 'none'}")
-        arrays = {name: _read_array(archive, held[name]) for name in names}
+        arrays = {name: _member(archive, held[name]) for name in names}
     return {name: torch.from_numpy(_signed(array)) for name, array in arrays.items()}
 
 
