@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from torchreg.io.clouds.npz import ARCHIVE_START, ARRAY_START, read_npy, read_npz, write_npz
@@ -58,114 +59,93 @@ def _is_stl(content: bytes) -> bool:
     return is_binary_stl(content) or (start.startswith(b"solid") and b"facet" in start)
 
 
+_cloud_format = partial(FileFormat, kind=CLOUDS, loader="load_points")
 # Told by content in this order, after the row of the ending. A new format is one more row.
 FORMATS: tuple[FileFormat, ...] = (
-    FileFormat(
+    _cloud_format(
         name="PLY",
-        kind=CLOUDS,
         endings=(".ply",),
         read=_from_content(read_ply),
         holds="ASCII, binary of both byte orders; polygons and triangle strips are cut",
-        loader="load_points",
         sniff=begins(b"ply\n", b"ply\r", b"ply "),
         write=write_ply,
         written=("normals", "colors", "faces"),
     ),
-    FileFormat(
+    _cloud_format(
         name="PCD",
-        kind=CLOUDS,
         endings=(".pcd",),
         read=_from_content(read_pcd),
         holds="ASCII, binary, binary_compressed",
-        loader="load_points",
         sniff=_is_pcd,
         write=write_pcd,
         written=("normals", "colors"),
     ),
-    FileFormat(
+    _cloud_format(
         name="PTX",
-        kind=CLOUDS,
         endings=(".ptx",),
         read=_from_content(read_ptx),
         holds="x y z, colors, each scan moved to its registered place",
-        loader="load_points",
         sniff=is_ptx,
     ),
-    FileFormat(
+    _cloud_format(
         name="XYZ and other tables",
-        kind=CLOUDS,
         endings=(".xyz", ".txt", ".pts", ".asc", ".xyzn", ".xyzrgb", ".tsv", ".dat"),
         read=_read_text,
         holds="x y z, normals, colors, intensity, with or without names of columns",
-        loader="load_points",
         sniff=looks_like_table,
         write=write_xyz,
         written=("normals",),
     ),
-    FileFormat(
+    _cloud_format(
         name="CSV",
-        kind=CLOUDS,
         endings=(".csv",),
         read=_read_text,
         holds="the same tables; also those of pandas, CloudCompare and ParaView",
-        loader="load_points",
         write=write_csv,
         written=("normals", "colors"),
     ),
-    FileFormat(
+    _cloud_format(
         name="OBJ",
-        kind=CLOUDS,
         endings=(".obj",),
         read=_from_content(read_obj),
         holds="vertices, faces, normals, colors; no materials",
-        loader="load_points",
         sniff=_is_obj,
     ),
-    FileFormat(
+    _cloud_format(
         name="STL",
-        kind=CLOUDS,
         endings=(".stl",),
         read=_from_content(read_stl),
         holds="binary, ASCII; corners at one place become one vertex",
-        loader="load_points",
         sniff=_is_stl,
     ),
-    FileFormat(
+    _cloud_format(
         name="OFF",
-        kind=CLOUDS,
         endings=(".off",),
         read=_from_content(read_off),
         holds="vertices and faces",
-        loader="load_points",
         sniff=begins(b"OFF", b"COFF", b"NOFF", b"CNOFF"),
     ),
-    FileFormat(
+    _cloud_format(
         name="glTF",
-        kind=CLOUDS,
         endings=(".glb", ".gltf"),
         read=read_gltf,
         holds="the default scene as viewers show it, skins and clips posed",
-        loader="load_points",
         sniff=_is_glb,
     ),
-    FileFormat(
+    _cloud_format(
         name="NPZ",
-        kind=CLOUDS,
         endings=(".npz",),
         read=_from_content(read_npz),
         holds="points (or vertices, verts, v), normals, colors, faces (or f)",
-        loader="load_points",
         sniff=begins(ARCHIVE_START),
         write=write_npz,
         written=("normals", "colors", "faces"),
     ),
-    FileFormat(
+    _cloud_format(
         name="NPY",
-        kind=CLOUDS,
         endings=(".npy",),
         read=_from_content(read_npy),
         holds="(N, 3) or more columns, (H, W, 3), fields x y z",
-        loader="load_points",
         sniff=begins(ARRAY_START),
     ),
 )

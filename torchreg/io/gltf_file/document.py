@@ -278,15 +278,12 @@ class GltfDocument:
         result = np.tile(np.eye(4), (len(nodes), 1, 1))
         columns = {key: self._node_numbers(nodes, key, default) for key, default in _NODE_DEFAULTS.items()}
         quaternion = columns["rotation"]
-        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        length = np.linalg.norm(quaternion, axis=1)
         has_matrix = np.array([node.get("matrix") is not None for node in nodes], dtype=bool)
-        if not (length[:, 0] > 0)[~has_matrix].all():
-            stuck = int((~(length[:, 0] > 0) & ~has_matrix).argmax())
+        if not (length > 0)[~has_matrix].all():
+            stuck = int((~(length > 0) & ~has_matrix).argmax())
             raise ModelError(f"the rotation of node {self.node_label(stuck)} is a zero quaternion")
-        axis, w = (part / np.where(length > 0, length, 1.0) for part in (quaternion[:, :3], quaternion[:, 3:]))
-        cross = np.cross(np.eye(3), axis[:, None])
-        rotation = np.eye(3) + 2 * w[:, None] * cross + 2 * cross @ cross
-        result[:, :3, :3] = rotation * columns["scale"][:, None]
+        result[:, :3, :3] = rotation_matrices(quaternion) * columns["scale"][:, None]
         result[:, :3, 3] = columns["translation"]
         result[has_matrix] = columns["matrix"].reshape(-1, 4, 4).swapaxes(1, 2)[has_matrix]
         return result
