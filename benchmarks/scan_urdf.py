@@ -30,7 +30,7 @@ import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import invert_rigid
-from torchreg.io.urdf_record import UrdfPrimitive
+from torchreg.io.urdf_file.record import UrdfPrimitive
 from torchreg.registration.robots.model import RobotModel
 from torchreg.shapes.posed_tree import PosedTree
 from torchreg.shapes.robots import solid_mesh

@@ -38,8 +38,8 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.visibility import aim, rasterize
 from torchreg.io.gltf import load_rig
-from torchreg.io.gltf_clip import pose_nodes
-from torchreg.io.gltf_document import GltfDocument
+from torchreg.io.gltf_file.clip import pose_nodes
+from torchreg.io.gltf_file.document import GltfDocument
 from torchreg.io.limits import DEFAULT_LIMITS
 from torchreg.shapes.record import record_shape
 from torchreg.shapes.shape_space import LinearSpace

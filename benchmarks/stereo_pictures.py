@@ -32,8 +32,8 @@ from experiments.made_up.videos import shape_video
 from torchreg.capture.disparity import match_disparity
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.io.clouds.npz import save_arrays
 from torchreg.io.images import save_image
-from torchreg.io.npz import save_arrays
 
 MOTIONS = ("rotation", "bending_palm", "flip")
 TIPS = [4, 8, 12, 16, 20]

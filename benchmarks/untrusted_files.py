@@ -31,11 +31,11 @@ from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.calibration import load_depth_camera, save_cameras, save_depth_camera
-from torchreg.io.colmap import save_colmap
+from torchreg.io.cameras.colmap import save_colmap
+from torchreg.io.cameras.opencv_yaml import save_opencv
 from torchreg.io.frames import load_frames, save_frames
 from torchreg.io.gltf import load_rig
 from torchreg.io.images import load_depth, load_image, load_mask, save_depth, save_image
-from torchreg.io.opencv_yaml import save_opencv
 from torchreg.io.points import load_points, save_points
 from torchreg.io.swc import load_swc, save_swc
 from torchreg.io.urdf import load_urdf

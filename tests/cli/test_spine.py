@@ -1,5 +1,7 @@
 """Spines from the command line: what is printed and written, order of frames, resumed runs, errors."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -139,3 +141,14 @@ def test_tips_that_may_grow(run, starfish, tmp_path):
     answer = run("spine", starfish, "-o", tmp_path / "a.glb", "--growing", "--quiet", "--workers", 1)
     assert answer.exit_code == 0, answer.output
     assert tr.load(tmp_path / "a.safetensors").births.tolist() == [0] * 5
+
+
+@pytest.mark.parametrize("origin", [None, (4.0e5, -5.0e6, 30.0)])
+def test_mesh_of_a_picture_begins_at_the_origin(origin):
+    from torchreg.cli.writers import Source
+
+    near = tr.TriangleMesh(torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
+    origin = None if origin is None else torch.tensor(origin, dtype=torch.float64)
+    far = tr.TriangleMesh(near.vertices + (0.0 if origin is None else origin), near.faces)
+    mesh = Source([SimpleNamespace(origin=origin)]).about_origin(far)
+    torch.testing.assert_close(mesh.vertices, near.vertices, atol=1e-8, rtol=0.0)

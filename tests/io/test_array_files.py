@@ -11,9 +11,9 @@ import torch
 
 import torchreg as tr
 from tests.io.helpers import put, read, refused
+from torchreg.io.clouds.npz import save_arrays
 from torchreg.io.images import load_depth, load_mask
 from torchreg.io.limits import FileLimits, open_zip
-from torchreg.io.npz import save_arrays
 from torchreg.io.points import save_points
 
 FormatError = tr.errors.FormatError

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import torchreg as tr
 from tests.io.helpers import put, read, refused
+from torchreg.io.clouds.pcd import decompress_lzf
+from torchreg.io.clouds.raw_cloud import fan_triangles, strip_triangles
 from torchreg.io.limits import FileLimits
-from torchreg.io.pcd import decompress_lzf
-from torchreg.io.raw_cloud import fan_triangles, strip_triangles
 
 FormatError, FileWarning = tr.errors.FormatError, tr.errors.FileWarning
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 import torchreg as tr
 from tests.io.helpers import put, refused
 from torchreg.io.calibration import load_depth_camera, save_cameras, save_depth_camera
-from torchreg.io.colmap import save_colmap
+from torchreg.io.cameras.colmap import save_colmap
+from torchreg.io.cameras.opencv_yaml import load_opencv, save_opencv
 from torchreg.io.limits import FileLimits
-from torchreg.io.opencv_yaml import load_opencv, save_opencv
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
 PLAIN = {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 319.5, "cy": 239.5}

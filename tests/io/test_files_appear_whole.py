@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.io.helpers import put, refused
 from torchreg.io import atomic
 from torchreg.io.atomic import write_atomic
 
@@ -19,20 +20,14 @@ def test_content_is_written_byte_for_byte_and_alone(tmp_path, content):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_longer_old_file_is_replaced_whole(tmp_path):
-    path = tmp_path / "f"
+def test_a_longer_old_file_is_replaced_whole_and_who_has_it_open_keeps_reading_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a name without folder is taken from the working folder
+    path = Path("f")
     path.write_bytes(b"old" * 1000)
-    write_atomic(path, b"new")
-    assert path.read_bytes() == b"new"
-
-
-def test_who_has_the_old_file_open_keeps_reading_it(tmp_path):
-    path = tmp_path / "f"
-    path.write_bytes(b"old")
     with path.open("rb") as stream:
         write_atomic(path, b"new")
-        assert stream.read() == b"old"
-    assert path.read_bytes() == b"new"
+        assert stream.read() == b"old" * 1000
+    assert (tmp_path / "f").read_bytes() == b"new"
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
@@ -91,17 +86,11 @@ def test_the_bytes_reach_the_disk_before_the_name_and_the_folder_after(tmp_path,
 
 
 def test_places_that_cannot_be_written(tmp_path):
-    with pytest.raises(IsADirectoryError, match=r"is a folder; name a file in it"):
-        write_atomic(tmp_path, b"")
-    with pytest.raises(FileNotFoundError, match=r"the folder .*none does not exist; create it first"):
-        write_atomic(tmp_path / "none" / "f", b"")
-    (tmp_path / "file").write_bytes(b"old")
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        write_atomic(tmp_path / "file" / "f", b"")
+    put(tmp_path, "file", "old")
+    refused((lambda: write_atomic(tmp_path, b""), r"is a folder; name a file in it"), error=IsADirectoryError)
+    refused(
+        (lambda: write_atomic(tmp_path / "none" / "f", b""), "the folder .*none does not exist; create it first"),
+        (lambda: write_atomic(tmp_path / "file" / "f", b""), "does not exist"),
+        error=FileNotFoundError,
+    )
     assert [place.name for place in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_name_without_folder_is_taken_from_the_working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_atomic(Path("f"), b"new")
-    assert (tmp_path / "f").read_bytes() == b"new"

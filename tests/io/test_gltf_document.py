@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import torchreg as tr
 from tests.io.helpers import KINDS, TYPES, refused
-from torchreg.io.gltf_document import GltfDocument, parents_first
+from torchreg.io.gltf_file.document import GltfDocument, parents_first
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 
 FormatError, ModelError = tr.errors.FormatError, tr.errors.ModelError
@@ -53,9 +53,9 @@ def test_accessors_of_every_kind(kind, width, stride, offset):
 
 
 def test_normalized_integers_span_their_range():
-    extremes = np.array([[-128, 0, 127]], "i1")
-    assert opened(holding(extremes, normalized=True)).accessor(0).tolist() == [[-1.0, 0.0, 1.0]]
-    assert opened(holding(np.array([[0, 255]], "u1"), normalized=True)).accessor(0).tolist() == [[0.0, 1.0]]
+    extremes = np.array([[-128, -32, 64, 127]], "i1")
+    assert opened(holding(extremes, normalized=True)).accessor(0).tolist() == [[-1.0, -32 / 127, 64 / 127, 1.0]]
+    assert opened(holding(np.array([[0, 51, 255]], "u1"), normalized=True)).accessor(0).tolist() == [[0.0, 0.2, 1.0]]
     assert opened(holding(np.array([[0.5]], "<f4"), normalized=True)).accessor(0).tolist() == [[0.5]]
 
 

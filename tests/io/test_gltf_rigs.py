@@ -270,7 +270,7 @@ def test_numbers_that_are_refused(tmp_path, error, changes, options, words):
 
 def test_budgets_and_overflow_along_the_hierarchy(tmp_path, scene, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr("torchreg.io.gltf_document.FILE_BUDGET", replace(FILE_BUDGET, nodes=2))
+        patch.setattr("torchreg.io.gltf_file.document.FILE_BUDGET", replace(FILE_BUDGET, nodes=2))
         refused((lambda: loaded(tmp_path, scene), "3 nodes, at most 2"))
     large = scene.node(scale=[1e200] * 3, children=[1])
     scene.json["scenes"][0]["nodes"] = [scene.node(scale=[1e200] * 3, children=[large]), 2]

@@ -240,8 +240,24 @@ def test_content_decides_where_the_ending_is_wrong(tmp_path):
     save_points(tmp_path / "real.ply", SPHERE.vertices, faces=SPHERE.faces)
     for name in ("scan.obj", "scan", "scan.bin", "scan.stl"):
         assert len(tr.load_mesh(put(tmp_path, name, (tmp_path / "real.ply").read_bytes())).faces) == 80
-    np.save(tmp_path / "a.npy", POINTS)
-    assert len(tr.load_points((tmp_path / "a.npy").rename(tmp_path / "real.dat"))) == 12
+    for kind in ("glb", "stl", "stl_ascii", "off"):
+        for ending in (".dat", ".csv", ".ply", ".npy"):
+            assert len(tr.load_mesh(put(tmp_path, f"scan{ending}", exported(kind))).faces) == 80
+
+
+@pytest.mark.parametrize("ending", [".dat", ".csv", ".txt", ".pts", ".obj", ".ply", ".png", ".bin"])
+@pytest.mark.parametrize("save", [np.save, np.savez, np.savez_compressed])
+def test_arrays_are_recognized_whatever_the_file_is_called(tmp_path, ending, save):
+    path = tmp_path / f"real{ending}"
+    for values in (np.ones((12, 3)), POINTS, np.ones((300, 3), "u1")):
+        with path.open("wb") as stream:
+            save(stream, values)
+        np.testing.assert_allclose(tr.load_points(path).points, values, rtol=1e-6) if save is np.save else None
+    stack = np.arange(1, 61.0).reshape(4, 5, 3)
+    with path.open("wb") as stream:
+        save(stream, stack)
+    if ending not in (".png", ".bin"):  # which no sequence is called
+        np.testing.assert_allclose(torch.stack(list(tr.load_frames(path))), stack)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from tests.io.helpers import Scene, put, refused, shift
 from tests.io.test_written_gltf import Player
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
-from torchreg.io.gltf_refit import save_refitted_rig
+from torchreg.io.gltf_file.refit import save_refitted_rig
 from torchreg.io.gltf_write import save_animated_skin
 
 NAMES, PARENTS, TIMES = ["hips", "thigh", "shin"], [-1, 0, 1], torch.tensor([0.0, 0.5, 2.0])

@@ -8,6 +8,7 @@ import os
 import pytest
 import torch
 
+from tests.io.helpers import refused
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.io.limits import FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
@@ -64,19 +65,12 @@ def test_json_is_readable_and_standard(saved):
     assert text.count("\n") > 20
 
 
-def test_nothing_at_all_can_be_saved(tmp_path):
-    save_tensors(tmp_path / "e.safetensors", {}, {"nan": math.nan, "tuple": (1, (2,))})
-    tensors, metadata = load_tensors(tmp_path / "e.safetensors")
-    assert tensors == {}
-    assert math.isnan(metadata["nan"])
-    assert metadata["tuple"] == [1, [2]]
-
-
-def test_saving_again_replaces_both(saved):
-    save_tensors(saved, {"one": torch.ones(1)}, {})
-    tensors, metadata = load_tensors(saved)
-    assert list(tensors) == ["one"]
-    assert metadata == {}
+def test_nothing_at_all_can_be_saved_and_saving_again_replaces_both(saved):
+    for tensors, numbers in (({}, {"nan": math.nan, "tuple": (1, (2,))}), ({"one": torch.ones(1)}, {})):
+        save_tensors(saved, tensors, numbers)
+        found, metadata = load_tensors(saved)
+        assert list(found) == list(tensors)
+        assert repr(metadata) == repr({"nan": math.nan, "tuple": [1, [2]]} if numbers else {})
 
 
 def test_every_flipped_byte_and_truncation_is_noticed(saved):
@@ -97,12 +91,9 @@ def test_damaged_json_is_refused(saved):
         beside.write_bytes(content[:place])
         with pytest.raises(FormatError, match=r"r\.json: cannot be read as JSON"):
             load_tensors(saved)
-    beside.write_bytes(b"[" * 100_000)
-    with pytest.raises(FormatError, match="cannot be read as JSON"):
-        load_tensors(saved)
-    beside.write_bytes(b"\xff\xfe")
-    with pytest.raises(FormatError, match="cannot be read as JSON"):
-        load_tensors(saved)
+    for content in (b"[" * 100_000, b"\xff\xfe"):
+        beside.write_bytes(content)
+        refused((lambda: load_tensors(saved), "cannot be read as JSON"))
 
 
 @pytest.mark.parametrize(
@@ -130,23 +121,19 @@ def test_right_checksum_of_a_damaged_file(saved):
         load_tensors(saved)
 
 
-def test_missing_files(saved, tmp_path):
-    with pytest.raises(FileNotFoundError):
-        load_tensors(tmp_path / "none.safetensors")
+def test_what_is_missing_too_large_or_called_otherwise(saved, tmp_path):
+    refused(
+        (lambda: load_tensors(tmp_path / "none.safetensors"), "none"),
+        (lambda: save_tensors(tmp_path / "no" / "r.safetensors", {}, {}), "does not exist; create it first"),
+        error=FileNotFoundError,
+    )
+    refused((lambda: save_tensors(saved.with_suffix(".pt"), {}, {}), r"must end in \.safetensors"), error=InputError)
+    refused(
+        (lambda: load_tensors(saved, limits=FileLimits(max_bytes=100)), "the limit is 100"),
+        (lambda: load_tensors("https://host/r.safetensors"), "is an address"),
+    )
     saved.with_suffix(".json").unlink()
-    with pytest.raises(FormatError, match=r"the file r\.json must lie beside it"):
-        load_tensors(saved)
-    with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
-        save_tensors(tmp_path / "no" / "r.safetensors", {}, {})
-
-
-def test_size_limit_and_addresses(saved):
-    with pytest.raises(FormatError, match="the limit is 100"):
-        load_tensors(saved, limits=FileLimits(max_bytes=100))
-    with pytest.raises(FormatError, match="is an address"):
-        load_tensors("https://host/r.safetensors")
-    with pytest.raises(InputError, match=r"path must end in \.safetensors"):
-        save_tensors(saved.with_suffix(".pt"), {}, {})
+    refused((lambda: load_tensors(saved), r"the file r\.json must lie beside it"))
 
 
 @pytest.mark.parametrize(

@@ -154,9 +154,10 @@ def test_columns_four_to_six_are_colors_normals_or_left_out(tmp_path):
     assert cloud.normals is None
     np.testing.assert_allclose(cloud.colors, fractions)
     assert read(tmp_path, "b.xyz", rows(POINTS, NORMALS)).colors is None
-    with pytest.warns(FileWarning, match=r"a\.xyz: columns 4 to 6 are left out: numbers from -.* to .* are neither"):
-        cloud = read(tmp_path, "a.xyz", rows(POINTS, 900 * POINTS))
-    assert (cloud.normals, cloud.colors) == (None, None)
+    for others in (900 * POINTS, 200 * fractions + 0.001, 70000 + np.arange(150).reshape(50, 3)):
+        with pytest.warns(FileWarning, match=r"a\.xyz: columns 4 to 6 are left out: numbers from .* to .* are neither"):
+            cloud = read(tmp_path, "a.xyz", rows(POINTS, others))
+        assert (cloud.normals, cloud.colors) == (None, None)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -308,8 +309,21 @@ def test_off_meshes(tmp_path):
         np.testing.assert_allclose(cloud.points, sphere.vertices, atol=1e-6)
         assert cloud.faces.tolist() == sphere.faces.tolist()
     cut = "\n".join(content.splitlines()[:60])
-    words = r"a\.off: the header says 42 vertices and 80 faces, the file holds 60 lines"
+    words = r"a\.off: the header says 42 vertices and 80 faces, 58 lines follow: it is cut off"
     refused((lambda: read(tmp_path, "a.off", cut), words))
+    colored = "COFF\n4 2 0\n0 0 0 1 0 0 1\n1 0 0 1 0 0 1\n1 1 0 1 0 0 1\n0 1 0 1 0 0 1\n4 0 1 2 3 9 9 9\n3 0 1 2\n"
+    cloud = read(tmp_path, "a.off", colored)
+    assert cloud.points.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert cloud.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
+    assert read(tmp_path, "a.off", "OFF 1 0 0\n1 2 3\n").points.tolist() == [[1, 2, 3]]
+    for old, new, words in (
+        ("3 0 1 2\n", "3 0 1\n", "a face has fewer corners than it says"),
+        ("3 0 1 2\n", "-3 0 1 2\n", "a face has fewer corners"),
+        ("3 0 1 2\n", "3 0 1 x\n", "a vertex index is not a row of 1 numbers"),
+        ("3 0 1 2\n", "3 0 1 4\n", "a face names vertex 4"),
+        ("1 0 0 1 0 0 1", "1 0", "a vertex is not a row of 3 numbers"),
+    ):
+        refused((lambda old=old, new=new: read(tmp_path, "a.off", colored.replace(old, new)), words))
 
 
 def ptx(points, pose, tail="", counts=None):

@@ -240,9 +240,12 @@ def test_impossible_robots_and_damaged_files(tmp_path, error, text, words):
 def test_size_limits_and_options(tmp_path, monkeypatch):
     trimesh.creation.box().export(tmp_path / "box.stl")
     path = put(tmp_path, "m.urdf", with_mesh("box.stl"))
+    visual = "<visual><geometry><mesh filename='box.stl'/></geometry></visual>"
+    twice = robot(f"<link name='a'>{visual * 2}</link>")
     refused(
         (lambda: load(tmp_path, ARM, limits=FileLimits(max_bytes=100)), "the limit is 100"),
-        (lambda: load_urdf(path, limits=FileLimits(max_points=10)), "36 vertices"),
+        (lambda: load_urdf(path, limits=FileLimits(max_points=7)), r"box\.stl: claims 8 points"),
+        (lambda: load(tmp_path, twice, limits=FileLimits(max_points=10)), "16 vertices"),
     )
     refused((lambda: load_urdf(path, meshes="maybe"), "meshes must be one of warn, require, skip"), error=ValueError)
     monkeypatch.setattr("torchreg.io.urdf.FILE_BUDGET", replace(FILE_BUDGET, xml_bytes=100))
@@ -365,12 +368,16 @@ def test_collada_comes_in_metres_and_without_its_looks(folder):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("bad.stl", b"solid nothing", r"bad\.stl"),
-        ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: not a readable stl mesh"),
-        ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: not a readable obj mesh"),
-        ("empty.obj", b"v 0 0 0\n", r"empty\.obj"),
-        ("bad.glb", b"glTF", r"bad\.glb: not a readable glb mesh"),
-        ("mesh.fbx", b"x", r"meshes of kind '\.fbx' are not read"),
+        ("bad.stl", b"solid nothing", r"bad\.stl: must hold 84 \+ 50 x 0 bytes"),
+        ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: .*it is cut off, damaged or not STL"),
+        ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: 1 of 3 points are not finite"),
+        ("far.obj", b"v 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n", r"far\.obj: a face names a vertex outside 1 to 3"),
+        ("empty.obj", b"v 0 0 0\n", r"empty\.obj: holds 1 points but no faces"),
+        ("bad.ply", b"ply\nformat ascii 1.0\n", r"bad\.ply: "),
+        ("bad.off", b"OFF\n8 6 0\n", r"bad\.off: the header says 8 vertices and 6 faces"),
+        ("bad.glb", b"glTF", r"bad\.glb: is cut off in its header"),
+        ("mesh.fbx", b"x", r"mesh\.fbx: is of a format that is not read .*export it as glTF"),
+        ("mesh.what", b"x", r"mesh\.what: has the unknown ending"),
     ],
 )
 @pytest.mark.parametrize("require", [True, False])

@@ -17,7 +17,7 @@ import torchreg as tr
 from tests.io.helpers import KINDS, TYPES, refused
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.upright import to_y_up
-from torchreg.io.gltf_morph import save_vertex_animation
+from torchreg.io.gltf_file.morph import save_vertex_animation
 from torchreg.io.gltf_write import save_animated_parts, save_animated_skin
 
 InputError = tr.errors.InputError

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.io.gltf_morph import save_vertex_animation
+from torchreg.io.gltf_file.morph import save_vertex_animation
 from torchreg.viz import gltf, pose_editor, scan_gltf, spine_gltf
 
 WEB = Path(__file__).parents[1] / "web"

@@ -218,7 +218,7 @@ def _spine_swc(path: Path, source: Source) -> None:
 
 
 def _spine_npz(path: Path, source: Source) -> None:
-    from torchreg.io.npz import save_arrays
+    from torchreg.io.clouds.npz import save_arrays
 
     names = ["tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own", "confidence"]
     names += ["births", "ends"] if source.result.births is not None else []
@@ -322,7 +322,7 @@ def _calibrated_glb(path: Path, source: Source) -> None:
 
 def _any_npz(path: Path, source: Source) -> None:
     """Write all tensors of a result, those of records inside as record.tensor."""
-    from torchreg.io.npz import save_arrays
+    from torchreg.io.clouds.npz import save_arrays
 
     save_arrays(path, dict(_tensors(vars(source.result), "")))
 

@@ -8,12 +8,7 @@ from pathlib import Path
 
 
 def write_atomic(path: Path, content: bytes) -> None:
-    """Write ``content`` to ``path`` in one step: a crash leaves the old file or the new one, never a part.
-
-    Args:
-        path: the file to write; its folder must exist.
-        content: of the file.
-    """
+    """Write a file in an existing folder in one step: a crash leaves the old file or the new one, never a part."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file in it")
     if not path.parent.is_dir():

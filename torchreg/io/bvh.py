@@ -12,8 +12,8 @@ from torchreg._checks import check_positive
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction, to_y_up
 from torchreg.io.atomic import write_atomic
-from torchreg.io.gltf_builder import Array, checked_numbers
-from torchreg.io.gltf_document import parents_first
+from torchreg.io.gltf_file.builder import Array, checked_numbers
+from torchreg.io.gltf_file.document import parents_first
 
 # Share of all lengths of a skeleton by which a joint may wander in its parent: rounding of float32.
 _FIXED = 1e-4

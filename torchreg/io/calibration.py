@@ -29,7 +29,8 @@ from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.io.atomic import write_atomic
-from torchreg.io.camera_entries import (
+from torchreg.io.cameras.colmap import load_colmap
+from torchreg.io.cameras.entries import (
     NUMBERS,
     camera_of,
     cameras_of,
@@ -38,11 +39,10 @@ from torchreg.io.camera_entries import (
     depth_unit,
     own_entry,
 )
-from torchreg.io.colmap import load_colmap
+from torchreg.io.cameras.opencv_yaml import PAIRS, read_opencv, read_opencv_values, values_of, yaml_object
 from torchreg.io.file_format import FileFormat, begins, check_stand_in, choose, naming, plain_text
 from torchreg.io.images import MILLIMETER
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_budget, local_path, read_bytes
-from torchreg.io.opencv_yaml import PAIRS, read_opencv, read_opencv_values, values_of, yaml_object
 
 FORMAT = "torchreg-cameras"
 _VERSION = 1

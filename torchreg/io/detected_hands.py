@@ -16,17 +16,11 @@ _LABELS = ("category_name", "categoryName", "label")
 
 @dataclass(frozen=True)
 class _Found:
-    """A hand in a picture.
+    """A hand in a picture."""
 
-    Args:
-        points: 21 of [column, row] in pixels, or [None, None] where a keypoint was not seen.
-        side: "left" or "right"; None where the detector did not say.
-        score: how sure of it the detector is.
-    """
-
-    points: list[list[Any]]
-    side: str | None
-    score: float
+    points: list[list[Any]]  # 21 of [column, row] in pixels, or [None, None] where a keypoint was not seen
+    side: str | None  # "left" or "right"; None where the detector did not say
+    score: float  # how sure of it the detector is
     count: ClassVar[int] = 21  # of keypoints: the wrist, and four of each finger
 
 
@@ -40,12 +34,8 @@ def detected_keypoints(
 ) -> list[list[Any]] | None:
     """Return the 21 keypoints of a frame in pixels, each [column, row], or of Nones; None if no such hand was found.
 
-    Args:
-        frame: what a detector wrote of it.
-        file: where it stands, for messages.
-        side: "left" or "right": of several hands the surest of that side; None for the surest at all. A single hand of
-            MediaPipe is taken whatever its side, which a mirrored picture swaps.
-        picture: (width, height), pixels, by which MediaPipe's are multiplied.
+    The surest of several hands of a side counts; a single hand of MediaPipe is taken whatever its side, which a
+    mirrored picture swaps. MediaPipe's keypoints are shares of the picture (width, height), pixels.
     """
     if isinstance(frame.get("people"), list):
         hands = _of_openpose(frame["people"], file)

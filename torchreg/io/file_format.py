@@ -29,19 +29,12 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class _Foreign:
-    """Formats that are not read.
+    """Formats that are not read."""
 
-    Args:
-        name: as people call them.
-        endings: lower case, with the dot.
-        starts: first bytes of their content, where these tell.
-        way: what to do about such a file.
-    """
-
-    name: str
-    endings: tuple[str, ...]
-    starts: tuple[bytes, ...]
-    way: str
+    name: str  # as people call them
+    endings: tuple[str, ...]  # lower case, with the dot
+    starts: tuple[bytes, ...]  # first bytes of their content, where these tell
+    way: str  # what to do about such a file
 
 
 # A new format is one more row.
@@ -78,29 +71,18 @@ _FOREIGN = (
 
 @dataclass(frozen=True, kw_only=True)
 class FileFormat:
-    """One format of files: a row of the table that loaders look in, `torchreg formats` prints and the docs show.
+    """One format of files: a row of the table that loaders look in, `torchreg formats` prints and the docs show."""
 
-    Args:
-        name: as people call it.
-        kind: what it holds: one of `KINDS` in `torchreg.io.formats`.
-        endings: lower case, with the dot; the first is the usual one.
-        read: from the content, the path (for files beside it) and the limits.
-        holds: what is read of it, in a few words.
-        loader: name of the public function that reads it.
-        sniff: whether content is of this format for sure; None where content does not tell.
-        write: a record to bytes; None for formats that are read only.
-        written: names of the parts that ``write`` keeps beside the points.
-    """
-
-    name: str
-    kind: str
-    endings: tuple[str, ...]
-    read: Callable[..., Any]
-    holds: str
-    loader: str
+    name: str  # as people call it
+    kind: str  # what it holds: one of `KINDS` in `torchreg.io.formats`
+    endings: tuple[str, ...]  # lower case, with the dot; the first is the usual one
+    read: Callable[..., Any]  # from the content, the path (for files beside it) and the limits
+    holds: str  # what is read of it, in a few words
+    loader: str  # name of the public function that reads it
+    # whether content is of this format for sure; None where content does not tell
     sniff: Callable[[bytes], bool] | None = None
-    write: Callable[[Any], bytes] | None = None
-    written: tuple[str, ...] = ()
+    write: Callable[[Any], bytes] | None = None  # a record to bytes; None for formats that are read only
+    written: tuple[str, ...] = ()  # names of the parts that ``write`` keeps beside the points
 
 
 def begins(*starts: bytes) -> Callable[[bytes], bool]:
@@ -114,12 +96,7 @@ def ending_of(path: Path) -> str:
 
 
 def choose(formats: Sequence[FileFormat], content: bytes, path: Path) -> FileFormat:
-    """Return the format of a file: told by its content for sure, else by its ending.
-
-    Raises:
-        FormatError: if neither tells; lists the endings, or names the way to convert what is of another known format.
-            Also if content only stands in for a file elsewhere.
-    """
+    """Return the format of a file: that of its content for sure, else of its ending; FormatError without any."""
     check_stand_in(content)
     ending = ending_of(path)
     named = [row for row in formats if ending in row.endings]

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from torchreg.io import calibration
-from torchreg.io.cloud_formats import FORMATS as CLOUDS
-from torchreg.io.colmap import load_colmap
+from torchreg.io.cameras.colmap import load_colmap
+from torchreg.io.clouds.cloud_formats import FORMATS as CLOUDS
 from torchreg.io.file_format import FileFormat
 from torchreg.io.frames import load_frames
 from torchreg.io.gltf import load_rig

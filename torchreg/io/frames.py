@@ -22,13 +22,13 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_positive, check_shape
 from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.cloud_formats import ENDINGS
+from torchreg.io.clouds.cloud_formats import ENDINGS
+from torchreg.io.clouds.frame_archives import may_be_archive, read_frame_archive
+from torchreg.io.clouds.raw_cloud import Array, RawCloud
 from torchreg.io.file_format import ending_of, naming, refuse_foreign
-from torchreg.io.frame_archives import read_frame_archive
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.natural_order import natural_sorted
 from torchreg.io.points import PointCloud, check_dtype, checked_cloud, load_points, save_points
-from torchreg.io.raw_cloud import Array, RawCloud
 
 # Beside meshes and clouds in one folder, files of these endings tell of them: times, poses, notes.
 _NOTES = (".csv", ".txt", ".dat", ".tsv", ".npy", ".asc")
@@ -177,7 +177,7 @@ def load_frames(
     if sort:
         files = natural_sorted(files)
     names, sources, faces = [str(file) for file in files], list[Path | Array](files), None
-    if len(files) == 1 and files[0].suffix.lower() in (".npz", ".npy"):
+    if len(files) == 1 and may_be_archive(files[0]):
         archive = read_frame_archive(files[0], limits)
         if archive is not None:
             names = [f"{files[0]}, frame {number}" for number in range(len(archive.rows))]

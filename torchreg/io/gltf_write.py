@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.upright import Direction, to_y_up
-from torchreg.io.gltf_builder import (
+from torchreg.io.gltf_file.builder import (
     DEFAULT_COLOR,
     Array,
     GltfBuilder,
@@ -23,7 +23,7 @@ from torchreg.io.gltf_builder import (
     checked_times,
     checked_triangles,
 )
-from torchreg.io.gltf_document import parents_first
+from torchreg.io.gltf_file.document import parents_first
 
 
 @dataclass(frozen=True)

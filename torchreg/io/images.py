@@ -18,11 +18,11 @@ from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
+from torchreg.io.clouds.npz import ARRAY_START, array_of, read_npy_header
 from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.masks import mask_of_numbers, mask_of_picture
 from torchreg.io.natural_order import last_number, natural_sorted
-from torchreg.io.npz import read_npy_header
 
 Found = TypeVar("Found")
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -99,7 +99,7 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
     content = read_bytes(file, limits)
     with naming(file):
         check_stand_in(content)
-        if file.suffix.lower() == ".npy":
+        if content.startswith(ARRAY_START):
             return torch.from_numpy(mask_of_numbers(_read_npy(content, file)).copy())
         return torch.from_numpy(_opened(content, file, mask_of_picture))
 
@@ -131,7 +131,7 @@ def load_depth(
     content = read_bytes(file, limits)
     with naming(file):
         check_stand_in(content)
-        values = _DEPTH_READERS.get(file.suffix.lower(), _decoded_depth)(content, file)
+        values = _depth_reader(content)(content, file)
         if values.dtype.kind not in "fiu" or values.dtype.itemsize < 2:
             raise FormatError(f"depth takes 16 bits or floating-point numbers, got {values.dtype}")
         if camera is not None and values.shape != (camera.height, camera.width):
@@ -278,15 +278,8 @@ def _decoded_depth(content: bytes, file: Path) -> Any:
 
 def _read_npy(content: bytes, file: Path) -> Any:
     """Return the array (H, W) of a ``.npy`` file."""
-    stream = io.BytesIO(content)
-    shape, fortran, dtype = read_npy_header(stream, f"{file}:")
-    _check_pixels(shape, file)
-    if dtype.kind not in "biuf":
-        raise FormatError(f"{file}: must hold truth values or real numbers, got {dtype}; objects are never loaded")
-    start = stream.tell()
-    if len(content) - start != shape[0] * shape[1] * dtype.itemsize:
-        raise FormatError(f"{file}: holds {len(content) - start} bytes, not {shape} numbers of {dtype}: cut off?")
-    return np.frombuffer(content, dtype, offset=start).reshape(shape, order="F" if fortran else "C")
+    _check_pixels(read_npy_header(io.BytesIO(content), f"{file}:", "biuf")[0], file)
+    return array_of(content, f"{file}:", "biuf")
 
 
 def _read_exr(content: bytes, file: Path) -> Any:
@@ -321,5 +314,9 @@ def _check_channels(known: Sequence[str], size: tuple[int, int], file: Path) -> 
         raise FormatError(f"{file}: has {len(known)} channels, together more than 64 megapixels; save the depth alone")
 
 
-# Readers of depth images that PIL does not decode.
-_DEPTH_READERS = {".npy": _read_npy, ".exr": _read_exr}
+def _depth_reader(content: bytes) -> Callable[[bytes, Path], Any]:
+    """Return the reader of a depth image by its first bytes; PIL's where no other fits."""
+    return next((read for start, read in _DEPTH_READERS.items() if content.startswith(start)), _decoded_depth)
+
+
+_DEPTH_READERS = {ARRAY_START: _read_npy, b"v/1\x01": _read_exr}

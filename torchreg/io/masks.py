@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchreg.errors import FileWarning
-from torchreg.io.raw_cloud import Array
+from torchreg.io.clouds.raw_cloud import Array
 
 
 @dataclass(frozen=True)

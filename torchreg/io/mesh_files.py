@@ -5,13 +5,10 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import io
-import struct
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,26 +18,8 @@ from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.io.file_format import check_stand_in
 from torchreg.io.limits import FileLimits, read_bytes
-from torchreg.io.raw_cloud import Array
-from torchreg.io.stl import is_binary_stl
+from torchreg.io.points import PARSER_ERRORS, load_mesh
 from torchreg.io.strict_xml import parse_xml
-
-_PARSER_ERRORS = (
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    RuntimeError,
-    ArithmeticError,
-    AssertionError,
-    SyntaxError,
-    EOFError,
-    MemoryError,
-    NameError,  # trimesh forgets variables where a file ends early
-    ImportError,  # trimesh asks for an encoding detector when text is not UTF-8
-    struct.error,
-)
-
 
 # Elements of COLLADA files without which meshes are read.
 _MATERIALS = ("library_images", "library_effects", "library_materials", "bind_material")
@@ -66,13 +45,7 @@ class MeshFiles:
         self._cache: dict[Path, TriangleMesh] = {}
 
     def read(self, filename: str, what: str) -> TriangleMesh | None:
-        """Return the triangles of a mesh file, float64; None if it cannot be read and is not required.
-
-        Args:
-            filename: relative to the folder of the description or one above, or ``file://``, ``package://``,
-                ``model://``; backslashes are slashes.
-            what: the name of the mesh in messages.
-        """
+        """Return the triangles of a mesh by path or address, float64; None if it is not there nor required."""
         tried = self._candidates(filename.replace("\\", "/"))
         found = next((file for path in tried if (file := _found(path)) is not None), None)
         if found is None:
@@ -86,8 +59,8 @@ class MeshFiles:
                 )
             self._missing(FormatError(f"{what}: {reason}"))
             return None
-        kind = _FORMATS.get(found.suffix.lower())
-        if kind is not None and kind.module is not None and importlib.util.find_spec(kind.module[0]) is None:
+        is_collada = found.suffix.lower() == ".dae"
+        if is_collada and importlib.util.find_spec("collada") is None:
             self._missing(
                 MissingExtraError(
                     f"{what}: COLLADA mesh {found} needs pycollada; install it with: "
@@ -102,8 +75,14 @@ class MeshFiles:
             except FormatError as error:
                 self._missing(FormatError(f"{what}: {found} {error}"))
                 return None
-            self._cache[found] = _read_mesh(found, content)
+            self._cache[found] = _read_collada(found, content) if is_collada else self._load(found)
         return self._cache[found]
+
+    def _load(self, file: Path) -> TriangleMesh:
+        """Return the triangles of a file of any other format; what is said of its colors and normals is no concern."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FileWarning)
+            return load_mesh(file, limits=self._limits, dtype=torch.float64)
 
     def _missing(self, error: FormatError | MissingExtraError) -> None:
         """Raise the error about a file that is not there, or tell it, as was asked for."""
@@ -155,82 +134,32 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _checked_stl(content: bytes) -> tuple[bytes, float]:
-    """Return an STL file and its unit; ValueError unless it is as long as its binary header says, or text.
-
-    The result of trimesh for other files depends on which detectors of encodings are installed.
-    """
-    if not is_binary_stl(content):
-        content.decode("utf-8")
-    return content, 1.0
-
-
-def _bare_collada(content: bytes) -> tuple[bytes, float]:
-    """Return a COLLADA document without materials, whose broken references would make the mesh fail, and its unit."""
-    root = parse_xml(content)
-    unit = root.find("{*}asset/{*}unit")
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag.rpartition("}")[2] in _MATERIALS:
-                parent.remove(child)
-    return ET.tostring(root), 1.0 if unit is None else float(unit.get("meter", "1"))
-
-
-@dataclass(frozen=True)
-class _MeshFormat:
-    """A format of meshes that trimesh reads.
-
-    Args:
-        prepare: returns the content for trimesh, and the metres per unit.
-        module: that trimesh needs for it, and the name of its error in ``module.common``.
-    """
-
-    prepare: Callable[[bytes], tuple[bytes, float]] = lambda content: (content, 1.0)
-    module: tuple[str, str] | None = None
-
-
-# By ending. A new format is one more row.
-_FORMATS = {
-    ".stl": _MeshFormat(_checked_stl),
-    ".obj": _MeshFormat(),
-    ".dae": _MeshFormat(_bare_collada, module=("collada", "DaeError")),
-    ".glb": _MeshFormat(),
-    ".ply": _MeshFormat(),
-    ".off": _MeshFormat(),
-}
-
-
-def _read_mesh(path: Path, content: bytes) -> TriangleMesh:
-    """Return the triangles of a mesh file, in metres where the file has a unit."""
-    ending = path.suffix.lower()
-    if ending not in _FORMATS:
-        raise FormatError(f"{path}: meshes of kind {ending!r} are not read; known: {', '.join(_FORMATS)}")
-    kind = _FORMATS[ending]
+def _read_collada(path: Path, content: bytes) -> TriangleMesh:
+    """Return the triangles of a COLLADA file in metres, read without materials, whose references may be broken."""
     import trimesh
-    from trimesh.exchange.stl import HeaderError
 
-    errors: tuple[type[BaseException], ...] = (*_PARSER_ERRORS, HeaderError)
-    if kind.module is not None:
-        errors = (*errors, getattr(importlib.import_module(f"{kind.module[0]}.common"), kind.module[1]))
+    damaged = importlib.import_module("collada.common").DaeError
     try:
-        content, unit = kind.prepare(content)
-        # From memory and without a resolver, so that no material or texture file is opened.
+        root = parse_xml(content)
+        unit = root.find("{*}asset/{*}unit")
+        scale = 1.0 if unit is None else float(unit.get("meter", "1"))
+        for parent in list(root.iter()):
+            for child in list(parent):
+                if child.tag.rpartition("}")[2] in _MATERIALS:
+                    parent.remove(child)
+        # From memory and without a resolver, so that no texture file is opened.
         with np.errstate(all="ignore"):  # what is not finite is refused with the triangles
-            scene = trimesh.load_scene(io.BytesIO(content), file_type=ending[1:], process=False, maintain_order=True)
-            pieces = [
-                _piece(geometry, scene.graph[node][0], unit)
-                for node in scene.graph.nodes_geometry
-                if isinstance(geometry := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
-            ]
-    except errors as error:
-        raise FormatError(f"{path}: not a readable {ending[1:]} mesh ({type(error).__name__}: {error})") from error
-    pieces = [piece for piece in pieces if piece.num_faces]
+            stream = io.BytesIO(ET.tostring(root))
+            scene = trimesh.load_scene(stream, file_type="dae", process=False, maintain_order=True)
+            pieces = list[TriangleMesh]()
+            for transform, name in (scene.graph[node] for node in scene.graph.nodes_geometry):
+                mesh = scene.geometry[name]
+                if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                    vertices = scale * (np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3])
+                    faces = torch.from_numpy(mesh.faces.astype(np.int64))
+                    pieces.append(TriangleMesh(torch.from_numpy(vertices), faces))
+    except (*PARSER_ERRORS, AssertionError, damaged) as error:
+        raise FormatError(f"{path}: not a readable dae mesh ({type(error).__name__}: {error})") from error
     if not pieces:
         raise FormatError(f"{path}: holds no triangles")
     return concatenate(pieces)
-
-
-def _piece(geometry: Any, transform: Array, unit: float) -> TriangleMesh:
-    """Return a mesh of trimesh, moved by a transform (4, 4), in metres."""
-    vertices = np.asarray(geometry.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
-    return TriangleMesh(torch.from_numpy(vertices * unit), torch.from_numpy(geometry.faces.astype(np.int64)))

@@ -29,12 +29,7 @@ def natural_sorted(paths: Iterable[Path]) -> list[Path]:
 
 
 def natural_key(path: str | os.PathLike[str], *, decimals: bool = True) -> list[tuple[int, Any, str]]:
-    """Return a key that sorts paths with the numbers in them as numbers: frame2 before frame10, 1.25 before 1.5.
-
-    Args:
-        path: of a file.
-        decimals: whether one point between digits is a decimal point; several, as in dates, never are.
-    """
+    """Return a key that sorts paths with the numbers in them as numbers: frame2 before frame10, 1.25 before 1.5."""
     key = list[tuple[int, Any, str]]()
     for number, piece in enumerate(_NUMBER.split(os.fspath(path))):
         # Digits of other scripts and leading zeros are distinguished by the text itself.

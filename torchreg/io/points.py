@@ -20,11 +20,11 @@ from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
-from torchreg.io.cloud_formats import FORMATS
+from torchreg.io.clouds.cloud_formats import FORMATS
+from torchreg.io.clouds.raw_cloud import Array, RawCloud, not_measured
 from torchreg.io.file_format import FileFormat, choose, naming, unpacked
-from torchreg.io.glb import read_gltf
+from torchreg.io.gltf_file.glb import read_gltf
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
-from torchreg.io.raw_cloud import Array, RawCloud, not_measured
 
 # Exceptions that struct, json, zipfile and numpy's text and header readers raise on damaged bytes.
 PARSER_ERRORS = (

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from torchreg.errors import FormatError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.columns import have_decimal_commas
+from torchreg.io.clouds.columns import have_decimal_commas
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 

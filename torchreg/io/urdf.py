@@ -20,8 +20,8 @@ from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.mesh_files import MeshFiles
 from torchreg.io.strict_xml import parse_lenient_xml
-from torchreg.io.urdf_record import UrdfPrimitive, UrdfRecord
-from torchreg.io.urdf_units import warn_about_lengths
+from torchreg.io.urdf_file.record import UrdfPrimitive, UrdfRecord
+from torchreg.io.urdf_file.units import warn_about_lengths
 
 # Attributes of a mimic joint: added to its multiple of the other.
 _MIMIC = ("offset", "multiplier")

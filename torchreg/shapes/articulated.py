@@ -14,8 +14,8 @@ from torchreg._checks import as_float_tensor, check_count, check_direction, chec
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Y_UP
+from torchreg.io.clouds.npz import load_arrays
 from torchreg.io.file_format import naming
-from torchreg.io.npz import load_arrays
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.bone_space import bone_space
 from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf

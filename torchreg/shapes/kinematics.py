@@ -13,7 +13,7 @@ from torchreg._checks import check_shape
 from torchreg.errors import InputTypeError, ModelError
 from torchreg.geometry.kinematic_tree import JOINT_TYPES, Joint, KinematicTree
 from torchreg.geometry.rotation import skew
-from torchreg.io.urdf_record import UrdfPrimitive, UrdfRecord
+from torchreg.io.urdf_file.record import UrdfPrimitive, UrdfRecord
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain

@@ -20,7 +20,7 @@ from torchreg.geometry.rigid import RIGID_TOLERANCE, invert_rigid, rigid_matrix,
 from torchreg.geometry.upright import Y_UP, Direction
 from torchreg.io.file_format import naming
 from torchreg.io.gltf import load_rig
-from torchreg.io.gltf_document import parents_first
+from torchreg.io.gltf_file.document import parents_first
 from torchreg.shapes.kinematics import neighbor_matrix, part_parents
 from torchreg.shapes.primitive_refinement import refine_primitives
 from torchreg.shapes.primitives import DeferredSolids, Primitive

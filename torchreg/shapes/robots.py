@@ -18,7 +18,7 @@ from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import rotation_between
 from torchreg.io.urdf import load_urdf
-from torchreg.io.urdf_record import UrdfPrimitive, UrdfRecord
+from torchreg.io.urdf_file.record import UrdfPrimitive, UrdfRecord
 from torchreg.shapes.kinematics import ForwardKinematics, read_chain
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES
 from torchreg.shapes.primitives import Primitive

@@ -176,6 +176,6 @@ def save_rig(
     frames = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
     # A joint of the file is the first of the frames that its axes are stacked on.
     positions = {joint.name: frames[index, :3, 3] for index, joint in enumerate(tree.joints) if joint.kind == "fixed"}
-    from torchreg.io.gltf_refit import save_refitted_rig
+    from torchreg.io.gltf_file.refit import save_refitted_rig
 
     return save_refitted_rig(path, source, surface.vertices, positions, skin=skin)

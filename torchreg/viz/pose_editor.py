@@ -14,7 +14,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction, guess_up
-from torchreg.io.gltf_morph import save_vertex_animation
+from torchreg.io.gltf_file.morph import save_vertex_animation
 from torchreg.io.points import save_points
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration

@@ -19,7 +19,7 @@ from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.poisson_disk import poisson_disk
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 from torchreg.geometry.sampling import even_order
-from torchreg.io.urdf_write import save_urdf
+from torchreg.io.urdf_file.write import save_urdf
 from torchreg.registration.robots.fit import Mechanism, settled
 from torchreg.registration.robots.joints import Candidate, best_joint, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps

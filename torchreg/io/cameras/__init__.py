@@ -1,0 +1,1 @@
+"""Readers of cameras of other programs: lenses, entries of JSON, COLMAP, OpenCV."""
