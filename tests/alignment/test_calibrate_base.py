@@ -10,7 +10,7 @@ import torchreg as tr
 from tests.alignment.made import ARM, offset
 from torchreg.alignment.base_frames import read_joints
 from torchreg.geometry.rigid import transform_points
-from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.visibility import sample_visible
 
 JOINTS = torch.tensor([[0.3, 0.9, -0.4], [-0.8, -1.1, 0.7], [1.6, 0.5, 1.1]], dtype=torch.float64)
@@ -87,6 +87,16 @@ def test_joints_that_do_not_fit_their_frame_are_named_and_do_not_count(arm, clou
     assert found.outliers == (() if wrong is None else (wrong,))
     assert found.status is (tr.Status.CONVERGED if wrong is None else tr.Status.WITH_WARNINGS)
     assert errors(found.T_camera_base)[0] < 0.004
+
+
+@pytest.mark.parametrize(("scale", "turned"), [(1.005, 0.0), (0.995, 0.0), (1.0, 0.01)])
+def test_errors_that_all_frames_share_lie_within_the_ellipsoid(arm, clouds, scale, turned):
+    """Distances that are off by half a percent, and an elbow half a degree off; 12.6 bounds 95 % of six dimensions."""
+    found = tr.calibrate_base(arm, [cloud * scale for cloud in clouds], JOINTS + torch.tensor([0.0, turned, 0.0]))
+    turn = so3_log((found.T_camera_base[:3, :3] @ BASE[:3, :3].mT)[None])[0]
+    error = torch.cat([found.T_camera_base[:3, 3] - BASE[:3, 3], turn])
+    assert float(error @ torch.linalg.solve(found.covariance, error)) < 12.6
+    assert float(found.covariance.diagonal()[:3].max().sqrt()) < 0.01
 
 
 OFF = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])

@@ -114,7 +114,7 @@ class BaseProblem:
         """Return cost, gradient and Gauss-Newton Hessian of the data ``seen`` (T, M); sigma and noise in metres."""
         prior = self.precision()
         cost, gradient, hessian = 0.5 * (prior * state[0].square()).sum(), prior * state[0], torch.diag(prior)
-        for residual, jacobian, weight in self._terms(state, seen):
+        for residual, jacobian, weight in self.terms(state, seen):
             beta = welsch_weight((residual / sigma).square())
             weighted = jacobian * (weight * beta / noise**2).unsqueeze(-1)
             cost = cost + 0.5 * (weight * (1 - beta)).sum() * (sigma / noise) ** 2
@@ -123,7 +123,7 @@ class BaseProblem:
         gradient = gradient.masked_fill(held, 0.0)
         return Linearization(cost[None], gradient[None], hessian.masked_fill(held | held.unsqueeze(-1), 0.0)[None])
 
-    def _terms(self, state: Tensor, seen: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def terms(self, state: Tensor, seen: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield residuals (N,), their Jacobian (N, 7 + J) and weights (N,): of the data, and of what is not there."""
         poses = self.poses(state)
         distance, jacobian = self.surface.distance_jacobian(self.data[0], poses)
@@ -175,11 +175,6 @@ class BaseFit:
     def linearization(self) -> Linearization:
         """Return the problem about the state."""
         return self.problem.linearize(self.state, self.problem.facing(self.state), self.sigma, self.noise)
-
-    def covariance(self) -> tuple[Tensor, Tensor]:
-        """Return the covariance (6, 6) of the base and the standard deviations (J,) of the offsets."""
-        found = _inverse(self.linearization().hessian[0])
-        return found[:BASE_DOFS, :BASE_DOFS], found.diagonal()[_OFFSETS:].clamp_min(0).sqrt()
 
     @property
     def depth(self) -> float:

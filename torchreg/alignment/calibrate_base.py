@@ -14,6 +14,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
+from torchreg.alignment.base_covariance import base_covariance
 from torchreg.alignment.base_fit import BASE_FIT, BaseFit, BaseProblem, approach_base, base_of, fit_base, fit_offsets
 from torchreg.alignment.base_frames import BaseFrame, read_frames
 from torchreg.alignment.base_search import PosedModel, rank_bases, search_base, seen_shares
@@ -152,7 +153,7 @@ def _result(
     status = Status.CONVERGED if fit.converged else Status.MAX_STEPS
     if outliers or not is_sole:
         status = Status.WITH_WARNINGS
-    covariance, offset_std = fit.covariance()
+    covariance, offset_std = base_covariance(fit)
     return BaseCalibration(
         T_camera_base=fit.base,
         offsets=fit.offsets,
