@@ -117,14 +117,15 @@ def show_coverage(arm: Arm) -> None:
 
 
 def show_made_up_coverage(arm: Arm, trials: int, scale: float) -> None:
-    """Print the coverage of made-up frames of a camera whose distances are off by a share, the same in all frames."""
+    """Print the coverage of made-up frames without doubt; the camera's distances are off by a share, alike in all."""
     for size in (1, 2, 3, 5):
         apart = []
         for trial in range(trials):
             clouds, joints, base = made_up_frames(arm, torch.Generator().manual_seed(100 + trial), size)
             clouds = [cloud * (1 + scale * (-1) ** trial) for cloud in clouds]
             found = tr.calibrate_base(arm.shape, clouds, joints)
-            apart.append(squared_distance(found.T_camera_base, base, found.covariance))
+            if found.status is tr.Status.CONVERGED:
+                apart.append(squared_distance(found.T_camera_base, base, found.covariance))
         print_coverage(f"made up, depth off by {scale:.1%}, frames {size}", apart)
 
 

@@ -155,3 +155,26 @@ def test_joints_come_in_many_forms(arm):
         torch.testing.assert_close(read_joints(arm, form, 3), JOINTS)
     torch.testing.assert_close(read_joints(arm, JOINTS.numpy().astype(np.float32), 3), JOINTS, atol=1e-6, rtol=0)
     assert read_joints(arm, [[0, 1, -1]], 1).tolist() == [[0.0, 1.0, -1.0]]
+
+
+@pytest.mark.parametrize("offsets", [False, True])
+def test_a_camera_on_a_link_is_found_in_its_frame(arm, offsets):
+    """Half a meter over the last link, looking down at the rest of the robot."""
+    link = arm.part_names[-1]
+    placed = offset(0.05, -0.1, 0.9)
+    placed[:3, :3] = so3_exp(torch.tensor([1.4, 0.5, -0.3], dtype=torch.float64))
+    generator, clouds = torch.Generator().manual_seed(0), []
+    for row in JOINTS:
+        pose = torch.nn.functional.pad(row, (6, 0))
+        to_camera = placed @ torch.linalg.inv(arm.part_transforms(pose)[-1])
+        skin = arm.file_skin()
+        mesh = tr.TriangleMesh(transform_points(to_camera, skin(pose)), skin.faces)
+        points = sample_visible(mesh, torch.zeros(3), 280, generator)[0]
+        clouds.append(points + 0.001 * torch.randn(points.shape, generator=generator, dtype=torch.float64))
+    found = tr.calibrate_base(arm, clouds, JOINTS - (OFF if offsets else 0), offsets, camera_link=link)
+    assert found.camera_link == link
+    assert found.status is tr.Status.CONVERGED
+    torch.testing.assert_close(found.T_camera_base, placed, rtol=0, atol=0.006)
+    assert not offsets or math.degrees(float((found.offsets - OFF)[1].abs())) < 0.3
+    with pytest.raises(tr.errors.InputError, match="camera_link must be a link of the robot"):
+        tr.calibrate_base(arm, clouds, JOINTS, camera_link="flange")

@@ -234,6 +234,8 @@ class BaseCalibration(Result):
         depth_offset: () distance by which the camera sees surfaces too near, along their normals, metres.
         outliers: frames that do not show the robot where the others have it, or not in their joints, by number.
         status: of the calibration at its end.
+        camera_link: link that carries the camera (eye in hand). ``T_camera_base`` and ``covariance`` are of this link
+            then, in place of the base.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -249,6 +251,7 @@ class BaseCalibration(Result):
     depth_offset: Tensor
     outliers: tuple[int, ...]
     status: Status
+    camera_link: str | None = None
 
 
 @dataclass(frozen=True)
