@@ -58,7 +58,7 @@ def test_the_base_is_found_without_a_start_and_a_frame_of_something_else_is_name
     assert shift < 0.002
     assert turn < 0.2
     std = found.covariance.diagonal().sqrt()
-    assert float(std[:3].max()) < 0.003
+    assert float(std[:3].max()) < 0.006  # half a percent of the distance, by which a camera may be off
     assert float(std[3:].max()) < math.radians(1)
     assert not found.offsets.any()
     assert abs(float(found.depth_offset)) < 0.001

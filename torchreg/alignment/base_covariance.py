@@ -31,26 +31,28 @@ def base_covariance(fit: BaseFit) -> tuple[Tensor, Tensor]:
 
     Data of a link share the error of its mesh, its joints and its mask. So joints and depth offset vary in two levels,
     from frame to frame and in all frames alike, by as much as moves a link by the noise; the camera's scale of depth
-    varies alike in all. These are marginalized (a linear mixed model), and the jackknife covariance over frames, which
-    sees errors without a model, is added.
+    varies alike in all. The first are marginalized (a linear mixed model), the scale is considered, and the jackknife
+    covariance over frames, which sees errors without a model, is added.
 
-    References: Laird and Ware 1982; Efron and Stein 1981.
+    References: Laird and Ware 1982; Schmidt 1966; Efron and Stein 1981.
     """
     gradients, hessians = _frame_systems(fit)
     prior = fit.problem.precision()
     slides = fit.problem.skin.shape.is_sliding[BASE_DOFS:].cpu()
     joint_std = torch.where(slides, fit.noise, fit.noise / (_ERRORS.lever * fit.problem.size)).double()
     shared = torch.where(fit.problem.free, prior[_FIT:], joint_std**-2)
-    scale = torch.tensor([_ERRORS.depth_scale**-2], dtype=torch.float64)
     own = pad(torch.cat([torch.tensor([fit.noise]).double(), joint_std]).square(), (BASE_DOFS, 1))
     identity = torch.eye(len(own), dtype=torch.float64)
     information = torch.linalg.solve(identity + hessians * own, hessians).sum(0)
-    information = information + torch.diag(torch.cat([prior[:_FIT], shared, scale]))
+    by_scale, information = information[:-1, -1], information[:-1, :-1] + torch.diag(torch.cat([prior[:_FIT], shared]))
     found = torch.linalg.pinv(0.5 * (information + information.mT), hermitian=True)
+    # The fit takes the scale for right, so what it explains wrongly by the base stays whatever the data (Schmidt).
+    moved = _ERRORS.depth_scale * (found @ by_scale)
+    found = found + moved.unsqueeze(-1) * moved
     base = found[:BASE_DOFS, :BASE_DOFS]
     if len(hessians) >= _ERRORS.least_frames:
         base = base + _jackknife(gradients[:, :_FIT], hessians[:, :_FIT, :_FIT], torch.diag(prior[:_FIT]))
-    offset_std = found.diagonal()[_FIT:-1].clamp_min(0).sqrt()
+    offset_std = found.diagonal()[_FIT:].clamp_min(0).sqrt()
     return base, torch.where(fit.problem.free, offset_std, 0.0)
 
 
