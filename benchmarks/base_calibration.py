@@ -5,7 +5,8 @@ exact). The base is sought from all frames and from each three of them, without 
 joints of each frame from its encoders plus noise of 0.2 radians, with that prior: how often three standard deviations
 cover the error, and how many joints are told within 5 degrees. Made-up frames are the same arm in random joints before
 a depth camera with 2 mm of noise, once with an offset of 1 degree at each joint in turn; then each frame alone, with
-the base held, from encoders with noise.
+the base held, from encoders with noise. Coverage is the share of subsets of frames whose 95 % ellipsoid holds the
+reference, or the base from frames apart.
 
     python benchmarks/base_calibration.py --data FOLDER       # FOLDER/xarm7: frames, camera.json, truth.json, URDF
 """
@@ -33,6 +34,8 @@ from torchreg.geometry.visibility import sample_visible
 # Where the base is told to be off, in base coordinates.
 WORKSPACE = torch.tensor([0.3, 0.0, 0.3, 1.0], dtype=torch.float64)
 ENCODER_STD, TOLD, SEEN = 0.2, math.radians(5), math.radians(1)
+CHI2_50, CHI2_95 = 5.348, 12.592  # of six degrees of freedom
+REFERENCE_M, REFERENCE_RAD = 0.003, math.radians(0.3)  # error of the reference along each axis: 5 mm in all
 NUM_POINTS, NOISE, OFFSET = 1500, 0.002, math.radians(1)
 
 
@@ -88,6 +91,56 @@ def show_bases(arm: Arm, triples: bool) -> None:
             f"{found.status.value}",
             flush=True,
         )
+
+
+def show_coverage(arm: Arm) -> None:
+    """Print how often 95 % ellipsoids of the base from some frames hold the reference, and that from others."""
+    count = len(arm.frames)
+    subsets = [chosen for size in range(1, count + 1) for chosen in itertools.combinations(range(count), size)]
+    found = {
+        chosen: tr.calibrate_base(arm.shape, [arm.frames[k] for k in chosen], arm.joints[list(chosen)])
+        for chosen in subsets
+    }
+    reference = torch.diag(torch.tensor([REFERENCE_M] * 3 + [REFERENCE_RAD] * 3, dtype=torch.float64).square())
+    for size in range(1, count + 1):
+        one = [found[chosen] for chosen in subsets if len(chosen) == size]
+        plain = [squared_distance(each.T_camera_base, arm.base, each.covariance) for each in one]
+        known = [squared_distance(each.T_camera_base, arm.base, each.covariance + reference) for each in one]
+        print_coverage(f"frames {size} against the reference", plain)
+        print_coverage(f"frames {size}, its error counted", known)
+    pairs = [(a, b) for a, b in itertools.combinations(subsets, 2) if not set(a) & set(b) and min(len(a), len(b)) > 1]
+    apart = [
+        squared_distance(found[a].T_camera_base, found[b].T_camera_base, found[a].covariance + found[b].covariance)
+        for a, b in pairs
+    ]
+    print_coverage("two or more frames against others", apart)
+
+
+def show_made_up_coverage(arm: Arm, trials: int, scale: float) -> None:
+    """Print the coverage of made-up frames without doubt; the camera's distances are off by a share, alike in all."""
+    for size in (1, 2, 3, 5):
+        apart = []
+        for trial in range(trials):
+            clouds, joints, base = made_up_frames(arm, torch.Generator().manual_seed(100 + trial), size)
+            clouds = [cloud * (1 + scale * (-1) ** trial) for cloud in clouds]
+            found = tr.calibrate_base(arm.shape, clouds, joints)
+            if found.status is tr.Status.CONVERGED:
+                apart.append(squared_distance(found.T_camera_base, base, found.covariance))
+        print_coverage(f"made up, depth off by {scale:.1%}, frames {size}", apart)
+
+
+def squared_distance(found: Tensor, base: Tensor, covariance: Tensor) -> float:
+    """Return the squared Mahalanobis distance of two bases (4, 4)."""
+    turn = so3_log((found[:3, :3] @ base[:3, :3].mT)[None])[0]
+    error = torch.cat([found[:3, 3] - base[:3, 3], turn])
+    return float(error @ torch.linalg.solve(covariance, error))
+
+
+def print_coverage(words: str, squared: list[float]) -> None:
+    """Print the share within the 95 % ellipsoid, and how wide it is by the median distance: 1 is right, 3 too wide."""
+    values = torch.tensor(squared, dtype=torch.float64)
+    share, wide = float((values < CHI2_95).double().mean()), math.sqrt(CHI2_50 / float(values.median()))
+    print(f"coverage, {words}: {share:.0%} of {len(values)}; ellipsoids {wide:.2f} times as wide as needed", flush=True)
 
 
 def show_joints(arm: Arm, seeds: int, config: tr.AlignConfig) -> None:
@@ -197,6 +250,9 @@ def main(arguments: list[str] | None = None) -> int:
     with torch.no_grad():
         show_bases(arm, triples=not options.smoke)
         if not options.smoke:
+            show_coverage(arm)
+            for scale in (0.0, 0.005):
+                show_made_up_coverage(arm, options.trials, scale)
             show_joints(arm, options.seeds, tr.AlignConfig())
             show_made_up(arm, options.trials, 5)
             show_made_up_joints(arm, options.seeds, 5)

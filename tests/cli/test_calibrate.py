@@ -2,6 +2,7 @@
 
 import json
 import re
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import pytest
@@ -46,6 +47,66 @@ def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, t
     assert list(written["offsets"]) == ["shoulder", "rail"]
     torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
     assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
+
+
+def transform_of(path):
+    """Return the camera's pose in its parent (4, 4), and the parent, of a robot's file."""
+    joint = next(joint for joint in ET.parse(path).getroot().iter("joint") if joint.get("name") == "camera_joint")
+    placed = torch.eye(4, dtype=torch.float64)
+    numbers = {name: [float(word) for word in joint.find("origin").get(name).split()] for name in ("xyz", "rpy")}
+    placed[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", numbers["rpy"]).as_matrix())
+    placed[:3, 3] = torch.tensor(numbers["xyz"])
+    return placed, joint.find("parent").get("link")
+
+
+def test_the_camera_joins_the_robot_in_its_file_and_for_easy_handeye(run, folder, clouds, tmp_path):
+    answer = run(
+        "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base",
+        "--urdf-out", tmp_path / "seen.urdf",
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    inverse = tr.load(tmp_path / "base.safetensors").T_camera_base.inverse()
+    placed, parent = transform_of(tmp_path / "seen.urdf")
+    torch.testing.assert_close(placed, inverse)
+    assert parent == "base"
+    assert tr.ArticulatedShape.from_urdf(tmp_path / "seen.urdf").dof_names[6:] == ("shoulder", "rail")
+    written = yaml_numbers(tmp_path / "base_handeye.yaml")
+    assert written["eye_on_hand"] == "false"
+    assert written["robot_base_frame"] == '"base"'
+    quaternion = [float(written[name]) for name in ("qx", "qy", "qz", "qw")]
+    torch.testing.assert_close(torch.from_numpy(Rotation.from_quat(quaternion).as_matrix()), inverse[:3, :3])
+    assert [float(written[name]) for name in "xyz"] == pytest.approx(inverse[:3, 3].tolist())
+
+
+def test_a_camera_on_a_link_joins_this_link(run, folder, tmp_path):
+    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
+    skin, files = arm.file_skin(), []
+    for number, joints in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
+        pose = torch.tensor([0.0] * 6 + list(joints))
+        to_camera = BASE @ arm.part_transforms(pose)[1].inverse()
+        vertices = skin(pose) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        save_points(
+            tmp_path / f"{number}.ply", sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
+        )
+        files.append(tmp_path / f"{number}.ply")
+    (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.9,0.2\n")
+    answer = run(
+        "calibrate", folder / "arm.urdf", *files, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base",
+        "--camera-link", "upper", "--urdf-out", tmp_path / "seen.urdf",
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    found = tr.load(tmp_path / "base.safetensors")
+    torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
+    placed, parent = transform_of(tmp_path / "seen.urdf")
+    torch.testing.assert_close(placed, found.T_camera_base.inverse())
+    assert parent == "upper"
+    assert yaml_numbers(tmp_path / "base_handeye.yaml")["robot_effector_frame"] == '"upper"'
+    assert json.loads((tmp_path / "base_transform.json").read_text())["ros2"].endswith("--child-frame-id upper")
+
+
+def yaml_numbers(path):
+    """Return the entries of two levels of a YAML file by name."""
+    return dict(line.strip().split(": ", 1) for line in path.read_text().splitlines() if ": " in line)
 
 
 def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(run, folder, clouds, tmp_path):

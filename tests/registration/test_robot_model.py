@@ -67,8 +67,12 @@ def test_kinds_axes_and_values_of_joints_are_found(scans, found):
         axis = torch.tensor(joint.axis, dtype=torch.float64)
         best = max(abs(float(axis @ torch.tensor(known).double())) for known in truth[joint.kind])
         assert math.degrees(math.acos(min(best, 1.0))) < 1
+        place = found.tree.joints.index(joint) - 1
+        # 3.7 standard deviations bound .999 of two directions.
+        assert math.acos(min(best, 1.0)) < 3.7 * float(found.axis_std[place]) < math.radians(5)
+        assert 0 <= float(found.origin_std[place]) < 0.02
     assert rand_errors(torch.tensor([0, 1, 2, 2, 3])[part], found.part) < 0.01
-    assert found.loose == ()
+    assert found.loose == found.undetermined == ()
     # Whatever the root, a joint's value is that of the truth but for its sign.
     spread = sorted(float((column - column[0]).abs().max()) for column in found.joint_values.mT)
     expected = sorted(float(values[:, k].abs().max()) for k in (0, 1, 3))

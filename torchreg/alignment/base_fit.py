@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
-from torchreg.alignment.base_frames import BaseFrame
+from torchreg.alignment.base_frames import BaseFrame, carrier
 from torchreg.alignment.fit.patches import independent_share
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.neighbors import sampling_distance
-from torchreg.geometry.rigid import rigid_matrix
-from torchreg.geometry.rotation import so3_exp, so3_log
+from torchreg.geometry.rigid import invert_rigid, rigid_matrix
+from torchreg.geometry.rotation import skew, so3_exp, so3_log
 from torchreg.shapes.pose_algebra import BASE_DOFS, retract
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import ShapeSurface
@@ -51,7 +51,8 @@ class BaseProblem:
     """All frames of a calibration. A state (1, 7 + J) is the base, a depth offset in metres, and the joints' offsets.
 
     The base is a translation and a rotation vector; `shares` are the independent parts of each frame's data; `free`
-    (J,) is True for joints with an offset.
+    (J,) is True for joints with an offset. Where a link carries the camera, the "base" of a state is ``T_camera_link``,
+    and that of each frame follows from its joints.
     """
 
     frames: tuple[BaseFrame, ...]
@@ -60,13 +61,21 @@ class BaseProblem:
     skin: LinearBlendSkin
     size: float
     free: Tensor
+    camera_part: int | None = None
 
     @classmethod
-    def of(cls, frames: Sequence[BaseFrame], surface: ShapeSurface, skin: LinearBlendSkin, size: float) -> BaseProblem:
-        """Return the problem without offsets."""
+    def of(
+        cls,
+        frames: Sequence[BaseFrame],
+        surface: ShapeSurface,
+        skin: LinearBlendSkin,
+        size: float,
+        camera_part: int | None = None,
+    ) -> BaseProblem:
+        """Return the problem without offsets; ``camera_part`` is the number of the link that carries the camera."""
         shares = tuple(independent_share(frame.points, size) for frame in frames)
         free = torch.zeros(skin.shape.num_dofs - BASE_DOFS, dtype=torch.bool)
-        return cls(frames=tuple(frames), shares=shares, surface=surface, skin=skin, size=size, free=free)
+        return cls(tuple(frames), shares, surface, skin, size, free, camera_part)
 
     def state(self, base: Tensor) -> Tensor:
         """Return the state (1, 7 + J) of a base (4, 4) without offsets."""
@@ -83,8 +92,27 @@ class BaseProblem:
     def poses(self, state: Tensor) -> Tensor:
         """Return the pose (T, num_dofs) of each frame, in the shape's dtype."""
         joints = torch.stack([frame.joints for frame in self.frames]) + state[0, _OFFSETS:]
-        base = state[0, :BASE_DOFS].expand(len(joints), BASE_DOFS)
+        bases = base_of(state) @ invert_rigid(carrier(self.skin.shape, joints, self.camera_part))
+        base = torch.cat([bases[:, :3, 3], so3_log(bases[:, :3, :3])], dim=-1)
         return torch.cat([base, joints], dim=-1).to(self.skin.shape.rest)
+
+    def _chart(self, state: Tensor, poses: Tensor) -> Tensor | None:
+        """Return the derivatives (T, 6 + J, 6 + J) of poses by the state without depth; None where they are one."""
+        if self.camera_part is None:
+            return None
+        shape, part, count = self.skin.shape, self.camera_part, poses.shape[-1]
+        rows, derivative = (value.cpu().double() for value in shape.transform_jacobian(poses, chart="tangent"))
+        link = rows[:, 4 * part : 4 * part + 4].mT
+        moved = derivative[:, 4 * part : 4 * part + 4, :, BASE_DOFS:].movedim(-1, 1).mT
+        spin = moved[..., :3] @ link[:, None, :, :3].mT
+        turn = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], dim=-1)
+        # The link stays where it is in the camera: the base moves against it, turned about the link.
+        base = poses[:, None, :3].cpu().double()
+        shift = -moved[..., 3] - torch.linalg.cross(turn, base - link[:, None, :, 3])
+        chart = torch.eye(count, dtype=torch.float64).repeat(len(poses), 1, 1)
+        chart[:, :BASE_DOFS, BASE_DOFS:] = torch.cat([shift, -turn], dim=-1).mT
+        chart[:, :3, 3:BASE_DOFS] = -skew(base[:, 0] - state[0, :3])
+        return chart
 
     @cached_property
     def data(self) -> tuple[Tensor, Tensor]:
@@ -114,7 +142,7 @@ class BaseProblem:
         """Return cost, gradient and Gauss-Newton Hessian of the data ``seen`` (T, M); sigma and noise in metres."""
         prior = self.precision()
         cost, gradient, hessian = 0.5 * (prior * state[0].square()).sum(), prior * state[0], torch.diag(prior)
-        for residual, jacobian, weight in self._terms(state, seen):
+        for residual, jacobian, weight in self.terms(state, seen):
             beta = welsch_weight((residual / sigma).square())
             weighted = jacobian * (weight * beta / noise**2).unsqueeze(-1)
             cost = cost + 0.5 * (weight * (1 - beta)).sum() * (sigma / noise) ** 2
@@ -123,14 +151,18 @@ class BaseProblem:
         gradient = gradient.masked_fill(held, 0.0)
         return Linearization(cost[None], gradient[None], hessian.masked_fill(held | held.unsqueeze(-1), 0.0)[None])
 
-    def _terms(self, state: Tensor, seen: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def terms(self, state: Tensor, seen: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Yield residuals (N,), their Jacobian (N, 7 + J) and weights (N,): of the data, and of what is not there."""
         poses = self.poses(state)
         distance, jacobian = self.surface.distance_jacobian(self.data[0], poses)
+        chart = self._chart(state, poses)
+        jacobian = jacobian if chart is None else jacobian.cpu().double() @ chart
         weight = torch.tensor(self.shares, dtype=torch.float64).unsqueeze(-1).expand(seen.shape)
         yield distance[seen].cpu().double() - state[0, _DEPTH], _with_depth(jacobian[seen], -1.0), weight[seen]
         rows, derivatives = self.skin.shape.transform_jacobian(poses, chart="tangent")
         placed = self.skin.place(rows)
+        if chart is not None:
+            derivatives = (derivatives.cpu().double() @ chart.unsqueeze(1)).to(derivatives)
         for frame, share, points, derivative in zip(self.frames, self.shares, placed, derivatives, strict=True):
             if frame.free_space is not None:
                 yield self._beside(frame.free_space, share, points, derivative)
@@ -165,7 +197,7 @@ class BaseFit:
     @property
     def base(self) -> Tensor:
         """``T_camera_base`` (4, 4)."""
-        return base_of(self.state)
+        return base_of(self.state)[0]
 
     @property
     def offsets(self) -> Tensor:
@@ -176,11 +208,6 @@ class BaseFit:
         """Return the problem about the state."""
         return self.problem.linearize(self.state, self.problem.facing(self.state), self.sigma, self.noise)
 
-    def covariance(self) -> tuple[Tensor, Tensor]:
-        """Return the covariance (6, 6) of the base and the standard deviations (J,) of the offsets."""
-        found = _inverse(self.linearization().hessian[0])
-        return found[:BASE_DOFS, :BASE_DOFS], found.diagonal()[_OFFSETS:].clamp_min(0).sqrt()
-
     @property
     def depth(self) -> float:
         """Distance by which all data lie outside of the surface, metres."""
@@ -188,8 +215,8 @@ class BaseFit:
 
 
 def base_of(state: Tensor) -> Tensor:
-    """Return the base (4, 4) of a state (1, 7 + J)."""
-    return rigid_matrix(so3_exp(state[:, 3:BASE_DOFS])[0], state[0, :3])
+    """Return the bases (T, 4, 4) of states or poses (T, D)."""
+    return rigid_matrix(so3_exp(state[:, 3:BASE_DOFS]), state[:, :3])
 
 
 def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> BaseFit:

@@ -52,6 +52,14 @@ class BaseFrame:
         return replace(self, points=kept, free_space=space)
 
 
+def carrier(shape: Articulation, joints: Tensor, part: int | None) -> Tensor:
+    """Return ``T_base_link`` (T, 4, 4), float64, of the part that carries the camera; None for a camera beside it."""
+    if part is None:
+        return torch.eye(4, dtype=torch.float64).expand(len(joints), 4, 4)
+    pose = torch.nn.functional.pad(joints, (BASE_DOFS, 0)).to(shape.rest)
+    return shape.part_transforms(pose)[:, part].cpu().double()
+
+
 def _spread(points: Tensor, count: int) -> Tensor:
     """Return at most ``count`` of points (M, 3), evenly in their order."""
     if len(points) <= count:

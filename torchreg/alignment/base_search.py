@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.base_frames import BaseFrame
+from torchreg.alignment.base_frames import BaseFrame, carrier
 from torchreg.alignment.search.rough_poses import spread_rotations
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, transform_points
@@ -41,17 +41,22 @@ _SEARCH = _BaseSearch()
 
 @dataclass(frozen=True, eq=False)
 class PosedModel:
-    """The robot in the joints of a frame, in base coordinates: points and outward normals (N, 3)."""
+    """The robot in the joints of a frame, in coordinates of its base, or of the link that carries the camera.
+
+    Points and outward normals (N, 3).
+    """
 
     points: Tensor
     normals: Tensor
     tree: NeighborTree
 
     @classmethod
-    def of_skin(cls, skin: LinearBlendSkin, joints: Tensor) -> PosedModel:
+    def of_skin(cls, skin: LinearBlendSkin, joints: Tensor, camera_part: int | None = None) -> PosedModel:
         """Return the points of a skin with normals at joints (J,)."""
         pose = torch.nn.functional.pad(joints, (BASE_DOFS, 0)).to(skin.shape.rest)
         points, normals = skin(pose).detach().cpu().double(), skin.posed_normals(pose).detach().cpu().double()
+        to_carrier = invert_rigid(carrier(skin.shape, joints[None], camera_part))[0]
+        points, normals = transform_points(to_carrier, points), normals @ to_carrier[:3, :3].mT
         return cls(points, normals, NeighborTree(points))
 
 

@@ -14,6 +14,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
+from torchreg.alignment.base_covariance import base_covariance
 from torchreg.alignment.base_fit import BASE_FIT, BaseFit, BaseProblem, approach_base, base_of, fit_base, fit_offsets
 from torchreg.alignment.base_frames import BaseFrame, read_frames
 from torchreg.alignment.base_search import PosedModel, rank_bases, search_base, seen_shares
@@ -22,7 +23,7 @@ from torchreg.alignment.fit.problem import fitted_surface, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.results import BaseCalibration
 from torchreg.capture.depth_frame import DepthFrame
-from torchreg.errors import TorchregWarning
+from torchreg.errors import InputError, TorchregWarning
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
@@ -39,6 +40,7 @@ class _Numbers:
     num_fitted: int = 3  # candidates of the search that are fitted
     num_coarse: int = 400  # data of each frame in these fits
     least_seen: float = 0.2  # share of the side towards the camera that data show: a frame with less has no robot
+    least_seen_in_hand: float = 0.02  # the same where the robot carries the camera, which shows little of it
     outlying: float = 0.5  # of the frames' median share, below which a frame is outlying
     num_moved: int = 600  # data of each frame by which its joints are compared with others
     gained: float = 0.04  # share of them that other joints of a frame explain beyond what they do of other frames
@@ -50,9 +52,17 @@ _NUMBERS = _Numbers()
 
 
 def calibrate_base(
-    shape: ArticulatedShape, frames: Sequence[Tensor | DepthFrame] | Tensor, poses: Any, offsets: bool = False
+    shape: ArticulatedShape,
+    frames: Sequence[Tensor | DepthFrame] | Tensor,
+    poses: Any,
+    offsets: bool = False,
+    *,
+    camera_link: str | None = None,
 ) -> BaseCalibration:
     """Return where a robot's base is in a camera's coordinates, from one or more frames with known joints.
+
+    With ``camera_link`` the camera moves with a link and sees other parts of the robot (eye in hand): the pose of this
+    link in camera coordinates is sought, the same in all frames.
 
     All frames together are searched for the base, without a start: rotations from all around, iterated closest points,
     and the side of the robot that faces the camera. The best candidates are fitted to the exact surfaces of the links,
@@ -67,6 +77,7 @@ def calibrate_base(
         poses: joints of each frame, metres and radians: (T, J) in the order of ``shape.dof_names[6:]``, (T, num_dofs),
             whose base is not used, or T dictionaries by name of joint; of any floating-point type.
         offsets: whether to look for constant offsets of the joints, too; those that the data do not tell stay zero.
+        camera_link: link that carries the camera; None for a camera that stands beside the robot.
 
     Returns:
         a `BaseCalibration`. Frames that do not show the robot where the others have it, or not in the joints given, do
@@ -74,7 +85,8 @@ def calibrate_base(
             explains the data as well, and FEW_INLIERS if no frame shows the robot.
 
     Raises:
-        InputError: if there is no frame, one is empty, or joints lie beyond their limits, lack, or are not finite.
+        InputError: if the robot has no such link, there is no frame, one is empty, or joints lie beyond their limits,
+            lack, or are not finite.
         InputTypeError: if an argument has the wrong type.
 
     Differentiable: no.
@@ -85,23 +97,32 @@ def calibrate_base(
     """
     with torch.no_grad(), one_thread():
         given = read_frames(shape, frames, poses)
+        part = _camera_part(shape, camera_link)
         skin = sample_skin(shape, _NUMBERS.num_skin)
         size, surface = model_size(skin), fitted_surface(shape)
-        models = [PosedModel.of_skin(skin, frame.joints) for frame in given]
-        coarse = BaseProblem.of([frame.thinned(_NUMBERS.num_coarse) for frame in given], surface, skin, size)
+        models = [PosedModel.of_skin(skin, frame.joints, part) for frame in given]
+        coarse = BaseProblem.of([frame.thinned(_NUMBERS.num_coarse) for frame in given], surface, skin, size, part)
         base, lead = _best_base(coarse, models)
         seen = seen_shares(base, given, models, size)
-        used = (seen >= max(_NUMBERS.least_seen, _NUMBERS.outlying * float(seen.median()))).tolist()
+        least = _NUMBERS.least_seen if part is None else _NUMBERS.least_seen_in_hand
+        used = (seen >= max(least, _NUMBERS.outlying * float(seen.median()))).tolist()
         kept = [frame for frame, is_used in zip(given, used, strict=True) if is_used]
-        problem = BaseProblem.of(kept or given, surface, skin, size)
+        problem = BaseProblem.of(kept or given, surface, skin, size, part)
         fit = _fitted(problem, base, offsets)
         wrong = iter(_wrong_joints(shape, fit)) if kept else iter(())
         used = [is_used and not next(wrong) for is_used in used]
         if sum(used) < len(kept):
             kept = [frame for frame, is_used in zip(given, used, strict=True) if is_used]
-            fit = _fitted(BaseProblem.of(kept, surface, skin, size), fit.base, offsets)
+            fit = _fitted(BaseProblem.of(kept, surface, skin, size, part), fit.base, offsets)
         outliers = tuple(number for number, is_used in enumerate(used) if not is_used)
-        return _result(fit, given, outliers, is_lost=not kept, is_sole=lead > _NUMBERS.rival)
+        return _result(fit, given, outliers, camera_link, is_lost=not kept, is_sole=lead > _NUMBERS.rival)
+
+
+def _camera_part(shape: ArticulatedShape, link: str | None) -> int | None:
+    """Return the number of the part that carries the camera."""
+    if link is not None and link not in shape.part_names:
+        raise InputError(f"camera_link must be a link of the robot, {', '.join(shape.part_names)}; got {link!r}")
+    return None if link is None else shape.part_names.index(link)
 
 
 def _fitted(problem: BaseProblem, base: Tensor, offsets: bool) -> BaseFit:
@@ -113,8 +134,12 @@ def _fitted(problem: BaseProblem, base: Tensor, offsets: bool) -> BaseFit:
 def _wrong_joints(shape: ArticulatedShape, fit: BaseFit) -> list[bool]:
     """Return of each frame of a fit whether other joints explain more of its data, compared with the other frames."""
     surface = fit.problem.surface
-    to_base, thinned = invert_rigid(fit.base), [frame.thinned(_NUMBERS.num_moved) for frame in fit.problem.frames]
-    rows = [transform_points(to_base, frame.points).to(shape.rest) for frame in thinned]
+    thinned = [frame.thinned(_NUMBERS.num_moved) for frame in fit.problem.frames]
+    bases = base_of(fit.problem.poses(fit.state)[:, :BASE_DOFS].double())
+    rows = [
+        transform_points(invert_rigid(base), frame.points).to(shape.rest)
+        for base, frame in zip(bases, thinned, strict=True)
+    ]
     data = pad_sequence(rows, batch_first=True)
     valid = torch.arange(data.shape[1]) < torch.tensor([len(row) for row in rows]).unsqueeze(-1)
     joints = torch.stack([frame.joints for frame in thinned]) + fit.offsets
@@ -138,21 +163,27 @@ def _best_base(problem: BaseProblem, models: Sequence[PosedModel]) -> tuple[Tens
     """Return the best base (4, 4) of a search, and its relative lead over the next."""
     frames, size = problem.frames, problem.size
     candidates, _ = search_base(frames, models, size)
-    fitted = [base_of(approach_base(problem, problem.state(base))) for base in candidates[: _NUMBERS.num_fitted]]
+    fitted = [base_of(approach_base(problem, problem.state(base)))[0] for base in candidates[: _NUMBERS.num_fitted]]
     bases, costs = rank_bases(torch.stack(fitted), frames, models, size)
     lead = float(costs[1] / costs[0]) - 1 if len(costs) > 1 else float("inf")
     return bases[0], lead
 
 
 def _result(
-    fit: BaseFit, frames: Sequence[BaseFrame], outliers: tuple[int, ...], *, is_lost: bool, is_sole: bool
+    fit: BaseFit,
+    frames: Sequence[BaseFrame],
+    outliers: tuple[int, ...],
+    link: str | None,
+    *,
+    is_lost: bool,
+    is_sole: bool,
 ) -> BaseCalibration:
     everything = replace(fit.problem, frames=tuple(frames))
     residuals = torch.stack([row.abs().median() for row in everything.residuals(fit.state)])
     status = Status.CONVERGED if fit.converged else Status.MAX_STEPS
     if outliers or not is_sole:
         status = Status.WITH_WARNINGS
-    covariance, offset_std = fit.covariance()
+    covariance, offset_std = base_covariance(fit)
     return BaseCalibration(
         T_camera_base=fit.base,
         offsets=fit.offsets,
@@ -162,4 +193,5 @@ def _result(
         depth_offset=torch.tensor(fit.depth, dtype=torch.float64),
         outliers=outliers,
         status=Status.FEW_INLIERS if is_lost else status,
+        camera_link=link,
     )

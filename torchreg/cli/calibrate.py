@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from torchreg.alignment.results import BaseCalibration
     from torchreg.capture.depth_frame import DepthFrame
     from torchreg.shapes.articulated import ArticulatedShape
+
+
+_CAMERA = "camera"  # the frame of the camera, whose axes are those of a picture
 
 
 @reporting
@@ -53,6 +57,16 @@ def calibrate(
     *,
     views: DepthOptions,
     offsets: Annotated[bool, typer.Option("--offsets", help="Look for constant offsets of the joints, too.")] = False,
+    camera_link: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LINK", help="Link that carries the camera (eye in hand); without it the camera stands still."
+        ),
+    ] = None,
+    urdf_out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.urdf", help="The robot with a link camera, axes right, down, forward."),
+    ] = None,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
     package_dir: PackageDir = None,
@@ -62,8 +76,9 @@ def calibrate(
 ) -> None:
     """Find a robot's base in a camera from frames with known joints; or fit a hand's size and proportions to clouds.
 
-    Of a robot RESULT_transform.json holds the base, what is known of it and ROS's static transform, and RESULT_seen a
-    picture of the robot over each frame. Joints whose names are those of the robot's file are read; offsets of joints
+    Of a robot RESULT_transform.json holds the base, what is known of it and ROS's static transform,
+    RESULT_handeye.yaml the camera as easy_handeye and MoveIt read it, and RESULT_seen a picture of the robot over each
+    frame. Joints whose names are those of the robot's file are read; offsets of joints
     that the frames do not tell stay zero.
 
     A hand is searched in every cloud. Clouds in which it is not surely found are told and left out.
@@ -74,11 +89,13 @@ def calibrate(
     output = with_ending(output, (".safetensors",), add=True)
     is_hand = not Path(shape).suffix
     transform = None if is_hand else output.with_name(f"{output.stem}_transform.json")
-    check_outputs([output, output.with_suffix(".json"), transform], force)
+    handeye = None if is_hand else output.with_name(f"{output.stem}_handeye.yaml")
+    check_outputs([output, output.with_suffix(".json"), transform, handeye, urdf_out], force)
     if is_hand:
         robot = {"--joints": joints, "--depth": views.depth or None, "--offsets": offsets or None, "--seen": seen}
+        more = {"--camera-link": camera_link, "--urdf-out": urdf_out}
         camera = {"--intrinsics": views.intrinsics, "--mask": views.mask, "--depth-range": views.depth_range}
-        check_used(False, "a robot", robot | camera)
+        check_used(False, "a robot", robot | more | camera)
     views.check()
     images = views.source(frames) if views.depth else None
     frames = cloud_files(frames) if images is None else [Path(name) for name in images.names]
@@ -93,15 +110,41 @@ def calibrate(
     folder = seen_folder(seen, output, force)
     from torchreg.alignment.calibrate_base import calibrate_base
 
-    found = calibrate_base(model, given, rows, offsets)
+    found = calibrate_base(model, given, rows, offsets, camera_link=camera_link)
     found.save(output)
     write_optional([transform], Source([found], shape=model))
+    _write_camera(handeye, urdf_out, shape, model, found)
     with OptionalOutput(folder):
         _draw_frames(folder, model, found, frames, given, rows)
     if not quiet:
         typer.echo(f"{_summary(model, found, frames)} -> {transform}")
     if not found.status.usable:
         raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _write_camera(
+    handeye: Path | None, urdf: Path | None, source: str, shape: ArticulatedShape, found: BaseCalibration
+) -> None:
+    """Write the camera's pose in its carrier, the base or a link, for easy_handeye, and into a robot's file."""
+    from torchreg.geometry.rigid import invert_rigid
+    from torchreg.geometry.rotation import so3_log
+    from torchreg.geometry.rotation_representations import quaternion_from_rotation_vector
+    from torchreg.io.atomic import write_atomic
+    from torchreg.io.urdf_file.write import save_urdf_with_camera
+
+    placed, base, link = invert_rigid(found.T_camera_base), shape.part_names[0], found.camera_link
+    w, x, y, z = quaternion_from_rotation_vector(so3_log(placed[None, :3, :3])[0]).tolist()
+    numbers = dict(zip("xyz", placed[:3, 3].tolist(), strict=True)) | {"qx": x, "qy": y, "qz": z, "qw": w}
+    lines = ["parameters:", f"  eye_on_hand: {str(link is not None).lower()}"]
+    frames = {"robot_base_frame": base, "robot_effector_frame": link or "", "tracking_base_frame": _CAMERA}
+    lines += [f"  {name}: {json.dumps(value)}" for name, value in frames.items()]
+    lines += ["transformation:", *(f"  {name}: {value!r}" for name, value in numbers.items())]
+    if handeye is not None:
+        with OptionalOutput(handeye):
+            write_atomic(handeye, ("\n".join(lines) + "\n").encode())
+    if urdf is not None:
+        with OptionalOutput(urdf):
+            save_urdf_with_camera(urdf, source, link or base, _CAMERA, placed)
 
 
 def _read_joints(path: Path, shape: ArticulatedShape, frames: Sequence[Path]) -> list[dict[str, float]]:
@@ -149,16 +192,20 @@ def _draw_frames(
     """Draw the robot over each frame."""
     import torch
 
+    from torchreg.geometry.rigid import invert_rigid
     from torchreg.geometry.rotation import so3_log
     from torchreg.viz.figures import save_scene
     from torchreg.viz.posed_scenes import posed_scene
 
-    base = found.T_camera_base
-    vector = torch.cat([base[:3, 3], so3_log(base[None, :3, :3])[0]])
+    part = None if found.camera_link is None else shape.part_names.index(found.camera_link)
     skin = shape.file_skin() if shape.surface is not None else None
     for number, (path, frame, row) in enumerate(zip(paths, frames, rows, strict=True)):
         joints = torch.tensor([row[name] for name in shape.dof_names[6:]], dtype=torch.float64) + found.offsets
-        pose = torch.cat([vector, joints]).to(shape.rest)
+        base = found.T_camera_base
+        if part is not None:
+            still = torch.cat([torch.zeros(6, dtype=torch.float64), joints]).to(shape.rest)
+            base = base @ invert_rigid(shape.part_transforms(still)[part].cpu().double())
+        pose = torch.cat([base[:3, 3], so3_log(base[None, :3, :3])[0], joints]).to(shape.rest)
         picture = folder / f"{number:02d}_{path.stem}.png"
         if hasattr(frame, "camera") and skin is not None and skin.faces is not None:
             _draw_over(picture, frame, skin(pose), skin.faces)
@@ -191,7 +238,7 @@ def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Pa
     """Return what was found in one line: its uncertainty, outlier frames, offsets."""
     std = found.covariance.diagonal().sqrt()
     words = [
-        f"{found.status}: base within {1e3 * float(std[:3].max()):.1f} mm and "
+        f"{found.status}: {found.camera_link or 'base'} within {1e3 * float(std[:3].max()):.1f} mm and "
         f"{math.degrees(float(std[3:].max())):.2f} degrees (one standard deviation)",
         f"data {1e3 * float(found.residuals.median()):.1f} mm from the robot",
     ]

@@ -305,12 +305,13 @@ def base_record(shape: ArticulatedShape, found: Any) -> Mapping[str, Any]:
     turn = {"qx": x, "qy": y, "qz": z, "qw": w}
     options = " ".join(f"--{name} {value:.9g}" for name, value in (place | turn).items())
     publish = f"ros2 run tf2_ros static_transform_publisher {options} --frame-id camera --child-frame-id"
+    carrier = found.camera_link or shape.part_names[0]
     std = found.covariance.diagonal().sqrt().tolist()
     return {
         "T_camera_base": base.tolist(), "translation": place, "rotation": turn, "std_translation_m": std[:3],
         "std_rotation_rad": std[3:], "offsets": dict(zip(shape.dof_names[6:], found.offsets.tolist(), strict=True)),
         "residuals_m": found.residuals.tolist(), "outliers": list(found.outliers), "status": found.status.value,
-        "ros2": f"{publish} {shape.part_names[0]}",
+        "camera_link": found.camera_link, "ros2": f"{publish} {carrier}",
     }  # fmt: skip
 
 

@@ -14,7 +14,8 @@ from torchreg.errors import FormatError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
-from torchreg.io.limits import local_path
+from torchreg.io.limits import local_path, read_bytes
+from torchreg.io.strict_xml import parse_lenient_xml
 
 # Limits of effort and velocity, which the format asks for, where nothing is known.
 _UNKNOWN = {"effort": "1", "velocity": "1"}
@@ -51,6 +52,48 @@ def save_urdf(
             _add_joint(robot, joint, links[joint.parent], link)
     ET.indent(robot)
     write_atomic(file, ET.tostring(robot, encoding="utf-8", xml_declaration=True))
+
+
+def save_urdf_with_camera(
+    path: str | os.PathLike[str], source: str | os.PathLike[str], parent: str, camera: str, placed: torch.Tensor
+) -> None:
+    """Write a robot's file again with a camera: a link without geometry and a fixed joint, named after it.
+
+    Args:
+        path: of the new .urdf file; names of meshes relative to the old one are changed to fit.
+        source: of the robot.
+        parent: link that carries the camera.
+        camera: name of its link, whose axes are those of a picture: right, down, forward.
+        placed: (4, 4) ``T_parent_camera``, metres.
+    """
+    file, given = local_path(path), local_path(source)
+    if file.suffix.lower() != ".urdf":
+        raise FormatError(f"{file} must end in .urdf")
+    robot = parse_lenient_xml(read_bytes(given))
+    taken = {element.get("name") for tag in ("link", "joint") for element in robot.findall(tag)}
+    if camera in taken or f"{camera}_joint" in taken:
+        raise FormatError(f"{given}: has a link or joint of the name {camera!r} or '{camera}_joint'; rename it")
+    for mesh in robot.iter("mesh"):
+        name = mesh.get("filename", "")
+        if name and ":" not in name and not os.path.isabs(name):
+            mesh.set("filename", os.path.relpath(given.resolve().parent / name, file.resolve().parent))
+    ET.SubElement(robot, "link", name=camera)
+    joint = ET.SubElement(robot, "joint", name=f"{camera}_joint", type="fixed")
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=camera)
+    ET.SubElement(joint, "origin", xyz=_numbers(placed[:3, 3].tolist()), rpy=_numbers(_roll_pitch_yaw(placed)))
+    ET.indent(robot)
+    write_atomic(file, ET.tostring(robot, encoding="utf-8", xml_declaration=True))
+
+
+def _roll_pitch_yaw(placed: torch.Tensor) -> tuple[float, float, float]:
+    """Return the angles about the fixed axes x, y, z, in this order, of a transform (4, 4)."""
+    rows = placed[:3, :3].double().tolist()
+    cosine = math.hypot(rows[0][0], rows[1][0])
+    pitch = math.atan2(-rows[2][0], cosine)
+    if cosine < 1e-9:  # roll and yaw turn about one axis there: yaw is zero
+        return math.atan2(-rows[1][2], rows[1][1]), pitch, 0.0
+    return math.atan2(rows[2][1], rows[2][2]), pitch, math.atan2(rows[1][0], rows[0][0])
 
 
 def _add_joint(robot: ET.Element, joint: Joint, parent: str, child: str) -> None:

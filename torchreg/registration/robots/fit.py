@@ -83,37 +83,83 @@ def fitted(
     return mechanism
 
 
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Gauss-Newton system of all frames: steps of each frame, D = 6 + K numbers, and of the axes, 6 K in all.
+
+    ``local`` (T, D, D) and its gradient (T, D), ``mixed`` (T, D, 6 K), ``outer`` (6 K, 6 K) and its gradient (6 K,),
+    and ``hold`` (6 K,), a trace of damping for directions that move no joint.
+    """
+
+    local: Tensor
+    local_gradient: Tensor
+    mixed: Tensor
+    outer: Tensor
+    outer_gradient: Tensor
+    hold: Tensor
+
+    @classmethod
+    def of(cls, surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
+        motions = mechanism.motions()
+        blocks = surfaces.blocks(motions, label, scale)
+        frames, size = mechanism.values.shape
+        by_value, by_axis = mechanism.jacobians(motions)
+        # Twists about the origin move a part's center c by v + w x c.
+        change = torch.eye(6).double().repeat(frames, size, 1, 1)
+        change[..., :3, 3:] = -skew(blocks.centers)
+        own = change @ torch.cat([torch.eye(6).double().expand(frames, size, 6, 6), by_value], -1)
+        shared = change @ by_axis.flatten(-2)
+        metric = torch.tensor([1.0] * 3 + [(0.5 * surfaces.size) ** 2] * 3, dtype=torch.float64)
+        weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
+        hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
+        local = (own.mT @ hessian @ own).sum(1)
+        return cls(
+            local=local + 1e-9 * torch.diag_embed(local.diagonal(dim1=-2, dim2=-1) + weight.mean()),
+            local_gradient=(own.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1),
+            mixed=(own.mT @ hessian @ shared).sum(1),
+            outer=(shared.mT @ hessian @ shared).sum((0, 1)),
+            outer_gradient=(shared.mT @ blocks.gradient.unsqueeze(-1)).sum((0, 1)).squeeze(-1),
+            hold=FIT.damping * weight.mean() * metric.repeat(size) + 1e-9,
+        )
+
+    def eliminated(self) -> tuple[Tensor, Tensor]:
+        """Return the frames' solutions (T, D, 6 K + 1) and the system (6 K, 6 K) of the axes (Schur complement)."""
+        solved = torch.linalg.solve(self.local, torch.cat([self.mixed, self.local_gradient.unsqueeze(-1)], -1))
+        return solved, self.outer - (self.mixed.mT @ solved[..., :-1]).sum(0) + torch.diag(self.hold)
+
+
 def _step(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
-    motions = mechanism.motions()
-    blocks = surfaces.blocks(motions, label, scale)
-    frames, size = mechanism.values.shape
-    by_value, by_axis = mechanism.jacobians(motions)
-    # Twists about the origin move a part's center c by v + w x c.
-    change = torch.eye(6).double().repeat(frames, size, 1, 1)
-    change[..., :3, 3:] = -skew(blocks.centers)
-    own = change @ torch.cat([torch.eye(6).double().expand(frames, size, 6, 6), by_value], -1)
-    shared = change @ by_axis.flatten(-2)
-    half = 0.5 * surfaces.size
-    metric = torch.tensor([1.0] * 3 + [half**2] * 3, dtype=torch.float64)
-    weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
-    hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
-    local = (own.mT @ hessian @ own).sum(1)
-    local_gradient = (own.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1)
-    local = local + 1e-9 * torch.diag_embed(local.diagonal(dim1=-2, dim2=-1) + weight.mean())
+    size = mechanism.values.shape[1]
+    system = _System.of(surfaces, mechanism, label, scale)
     if not axes:
-        step = -torch.linalg.solve(local, local_gradient)
+        step = -torch.linalg.solve(system.local, system.local_gradient)
         return mechanism.stepped(step[:, :6], step[:, 6:], torch.zeros(size, 6).double())
-    mixed = (own.mT @ hessian @ shared).sum(1)
-    outer = (shared.mT @ hessian @ shared).sum((0, 1))
-    outer_gradient = (shared.mT @ blocks.gradient.unsqueeze(-1)).sum((0, 1)).squeeze(-1)
-    # Frames are eliminated first (Schur complement); directions that move no joint are held by a trace of damping.
-    solved = torch.linalg.solve(local, torch.cat([mixed, local_gradient.unsqueeze(-1)], -1))
-    reduced = outer - (mixed.mT @ solved[..., :-1]).sum(0)
-    right = outer_gradient - (mixed.mT @ solved[..., -1:]).sum(0).squeeze(-1)
-    hold = FIT.damping * weight.mean() * metric.repeat(size) + 1e-9
-    step = -torch.linalg.solve(reduced + torch.diag(hold), right)
+    solved, reduced = system.eliminated()
+    step = -torch.linalg.solve(reduced, system.outer_gradient - (system.mixed.mT @ solved[..., -1:]).sum(0).squeeze(-1))
     own_step = -(solved[..., -1] + solved[..., :-1] @ step)
     return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step.reshape(size, 6))
+
+
+def axis_stds(
+    surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3).
+
+    Those in the worst direction across the axis, all other unknowns marginalized; zero for the root, and a slider's
+    axis lies nowhere.
+    """
+    _, reduced = _System.of(surfaces, mechanism, label, FIT.scales[-1] * noise.sigma).eliminated()
+    size = len(points)
+    everything = noise.sigma**2 * noise.repeats * torch.linalg.pinv(reduced, hermitian=True)
+    own = everything.reshape(size, 6, size, 6)[range(size), :, range(size)]
+    turns = mechanism.axes[:, 3:].any(-1)
+    directions = torch.where(turns.unsqueeze(-1), mechanism.axes[:, 3:], mechanism.axes[:, :3])
+    # A twist (v, w) turns a direction a by w x a, and moves a point p of the axis by v + w x p, what counts across it.
+    turned = torch.cat([torch.zeros(size, 3, 3).double(), -skew(directions)], -1)
+    across = torch.eye(3).double() - directions.unsqueeze(-1) * directions.unsqueeze(-2)
+    moved = across @ torch.cat([torch.eye(3).double().expand(size, 3, 3), -skew(points)], -1)
+    direction, place = (torch.linalg.eigvalsh(by @ own @ by.mT)[:, -1].clamp_min(0).sqrt() for by in (turned, moved))
+    return direction, torch.where(turns, place, 0.0)
 
 
 def settled(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> Mechanism:

@@ -20,7 +20,7 @@ from torchreg.geometry.poisson_disk import poisson_disk
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
-from torchreg.registration.robots.fit import Mechanism, settled
+from torchreg.registration.robots.fit import Mechanism, axis_stds, settled
 from torchreg.registration.robots.joints import Candidate, best_joint, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
@@ -34,6 +34,7 @@ class ModelNumbers:
     samples: int = 2500  # of the reference
     rounds: int = 2  # of links, joints and the fit of all; a third changes nothing on scans of arms
     thinned: float = 0.5  # of a scan's spacing, between points of a surface that is made of all scans
+    unsure: float = 0.087  # standard deviation of an axis that the scans do not determine, radians: five degrees
     margin: float = 0.05  # beyond the motions seen, that limits allow, radians, or shares of the diagonal
 
 
@@ -51,6 +52,10 @@ class RobotModel:
         base: (T, 4, 4) motions of the root link from the reference.
         residuals: (T,) median distances of the reference, moved by the joints, from the scans; zero for the reference.
         loose: names of the joints whose links move in more ways about each other than one joint allows.
+        axis_std: (J,) standard deviations of the joints' axes, radians, where the links are right.
+        origin_std: (J,) the same of where a hinge's axis lies, at its link's origin, in the scans' unit.
+
+    Joints that never moved are none: their links are one.
     """
 
     tree: KinematicTree
@@ -58,7 +63,15 @@ class RobotModel:
     joint_values: Tensor
     base: Tensor
     residuals: Tensor
+    axis_std: Tensor
+    origin_std: Tensor
     loose: tuple[str, ...] = ()
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the joints that moved, but whose axes the scans do not determine within five degrees."""
+        unsure = (self.axis_std > MODEL.unsure).tolist()
+        return tuple(joint.name for joint, is_unsure in zip(self.tree.joints[1:], unsure, strict=True) if is_unsure)
 
     def origins(self) -> Tensor:
         """Return where the frames of the links begin in the reference (L, 3)."""
@@ -124,7 +137,9 @@ def find_robot(
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
-    return _described(mechanism, points, link, frames, residuals, loose)
+    found = _described(mechanism, points, link, frames, residuals, loose)
+    axis, origin = axis_stds(surfaces, mechanism, label, noise, found.origins())
+    return replace(found, axis_std=axis[1:], origin_std=origin[1:])
 
 
 def without_welds(
@@ -216,6 +231,8 @@ def _described(
         joint_values=values[:, 1:],
         base=base,
         residuals=residuals,
+        axis_std=torch.zeros(len(joints) - 1, dtype=torch.float64),
+        origin_std=torch.zeros(len(joints) - 1, dtype=torch.float64),
         loose=tuple(names),
     )
 
