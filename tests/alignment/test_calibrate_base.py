@@ -8,7 +8,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import ARM, offset
-from torchreg.alignment.base_frames import read_joints
+from torchreg.alignment.base.frames import read_joints
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.visibility import sample_visible

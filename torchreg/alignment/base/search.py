@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.base_frames import BaseFrame, carrier
+from torchreg.alignment.base.frames import BaseFrame, carrier
 from torchreg.alignment.search.rough_poses import spread_rotations
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, transform_points

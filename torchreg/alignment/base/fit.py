@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
-from torchreg.alignment.base_frames import BaseFrame, carrier
+from torchreg.alignment.base.frames import BaseFrame, carrier
 from torchreg.alignment.fit.patches import independent_share
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.free_space import FreeSpace

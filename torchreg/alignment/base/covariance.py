@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchreg.alignment.base_fit import BaseFit
+from torchreg.alignment.base.fit import BaseFit
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.solvers.robust import welsch_weight
 

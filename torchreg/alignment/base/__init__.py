@@ -1,0 +1,1 @@
+"""Where a robot's base is in a camera's coordinates, and how surely."""
