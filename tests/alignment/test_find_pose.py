@@ -261,3 +261,31 @@ def test_misfits_are_searched_for_again(find, two_clouds, two_hands, monkeypatch
     assert searched == [(7, 2), (8, 1), (9, 1)]
     torch.testing.assert_close(found.best, two_hands, atol=1e-5, rtol=0)
     assert bool((found.costs[:, :1] <= found.costs).all())
+
+
+def test_the_poses_after_which_a_box_looks_alike_stand_in_the_result(tmp_path):
+    file = tmp_path / "box.urdf"
+    solid = "<link name='{}'><visual><geometry><box size='{}'/></geometry></visual></link>"
+    joint = (
+        "<joint name='lid' type='revolute'><parent link='box'/><child link='pin'/><axis xyz='0 0 1'/>"
+        "<limit lower='-0.1' upper='0.1' effort='1' velocity='1'/></joint>"
+    )
+    file.write_text(
+        f"<robot name='b'>{solid.format('box', '.3 .2 .1')}{solid.format('pin', '.02 .02 .02')}{joint}</robot>"
+    )
+    box = tr.ArticulatedShape.from_urdf(file)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(800, 3, generator=generator) - 0.5
+    face = torch.randint(0, 3, (800, 1), generator=generator)
+    points = points.scatter(1, face, 0.5 * points.gather(1, face).sign()) * torch.tensor([0.3, 0.2, 0.1])
+    turn = so3_exp(torch.tensor([[0.4, -1.1, 0.7]]))[0]
+    found = tr.align(box, points @ turn.mT + torch.tensor([0.5, 0.2, 0.9]))
+    assert found.rivals.shape == (3, box.num_dofs)
+    assert "another pose explains nearly as much, its base turned by 180, 180, 180 deg" in found.doubt
+    # The half turns about the three axes of the box: its rotation group.
+    local = so3_exp(found.pose[None, 3:6]).mT @ so3_exp(found.rivals[:, 3:6])
+    half_turns = torch.stack([torch.tensor(row).diag() for row in ((1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1))])
+    apart = (local[:, None] - half_turns).abs().amax((-2, -1))
+    assert float(apart.amin(1).max()) < 0.02
+    assert sorted(apart.argmin(1).tolist()) == [0, 1, 2]
+    assert found.rivals[:, :3].sub(found.pose[:3]).norm(dim=-1).max() < 1e-3

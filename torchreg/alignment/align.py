@@ -43,6 +43,7 @@ from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.search.in_picture import not_found_if_improbable, surest_crop
 from torchreg.alignment.search.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
+from torchreg.alignment.search.pose_search import mean_distances
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.alignment.shape.person_gradient import person_with_gradients
 from torchreg.alignment.shape.shape_fit import fit_coefficients, fitted_rig
@@ -63,6 +64,7 @@ class _Limits:
     min_inliers: int = 10  # fewer inliers, and the pose means nothing
     min_share: float = 0.02  # the same, as a share of the data
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
+    num_starts: int = 4  # of a search, of which rivals are told: a box looks alike from as many sides
 
 
 _LIMITS = _Limits()
@@ -194,12 +196,12 @@ def _align(
     on_step: OnStep | None,
 ) -> AlignResult:
     """Return the alignment to data near the origin."""
-    lead, seen = None, seen.drawn(shape, config.nan_policy, config.seed)
+    lead, rivals, seen = None, None, seen.drawn(shape, config.nan_policy, config.seed)
     if initial_pose is None and known is not None and known.places_base:
         initial_pose = known.start(shape)
     if initial_pose is None:
         search = _found_pose(shape, seen, model_points, known, source, config)
-        initial_pose, lead = search.starts.best, search.lead
+        initial_pose, lead, rivals = search.starts.best, search.lead, search.rivals
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
@@ -219,7 +221,8 @@ def _align(
             uncropped = without_cut(batch.problem, found.pose, seen.frames)
             found = refit_uncropped(batch, uncropped, found, config)
             found = continue_unconverged(batch, uncropped, found, config)
-        result = _result(batch, found, config, lead, uncropped, seen)  # inliers by eq. 2, the posterior by eq. 17
+        # Inliers by eq. 2, the posterior by eq. 17.
+        result = _result(batch, found, config, lead, uncropped, seen, rivals=rivals)
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
@@ -291,7 +294,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, source, model_points, search, known)
+        return search_everywhere(shape, seen, _LIMITS.num_starts, source, model_points, search, known)
 
 
 def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:
@@ -352,8 +355,10 @@ def _result(
     uncropped: AlignProblem,
     seen: Observation,
     error: SurfaceError | None = None,
+    rivals: Tensor | None = None,
 ) -> AlignResult:
     problem, pose = batch.problem, found.pose
+    rivals = None if rivals is None else _different(batch, pose, rivals)
     fitted, posed = DataOnShape.of(batch, found, config, problem.data, problem.valid), problem.skin(pose)
     everything = fitted if seen.everything is None else DataOnShape.of_all(batch, found, config, *seen.everything)
     cost = alignment_cost(problem, pose, torch.where(problem.valid, fitted.distances, 0.0))
@@ -362,7 +367,7 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    judgement = judge(uncropped, pose, lead, error, seen.frames)
+    judgement = judge(uncropped, pose, lead, error, seen.frames, rivals)
     confidence = torch.where(degenerate, 0.0, judgement.confidence)
     converged = found.change <= config.pose_atol
     converged = converged | judgement.converged if config.surface_steps or error is not None else converged
@@ -383,7 +388,15 @@ def _result(
         confidence=confidence,
         evidence=judgement.evidence.table(),
         doubt=judgement.doubt,
+        rivals=rivals,
     )
+
+
+def _different(batch: AlignBatch, pose: Tensor, rivals: Tensor) -> Tensor:
+    """Return rivals (B, R, num_dofs), NaN where they are as right as the poses (B, num_dofs) found."""
+    local = torch.cat([pose.unsqueeze(1), shifted(rivals, -batch.origin.unsqueeze(1))], dim=1)
+    apart = mean_distances(batch.problem, local)[:, 0, 1:] > CALIBRATION.right * batch.problem.size
+    return torch.where(apart.unsqueeze(-1), rivals, torch.nan)
 
 
 def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, confidence: float) -> Status:
@@ -405,4 +418,7 @@ def _unbatched(result: AlignResult) -> AlignResult:
         for item in fields(result)
         if item.name not in ("history", "origin", "shape") and getattr(result, item.name) is not None
     }
+    rivals = first.get("rivals")
+    if rivals is not None:
+        first["rivals"] = rivals[rivals.isfinite().all(-1)]
     return replace(result, **first)

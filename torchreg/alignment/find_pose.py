@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
-from torchreg.alignment.evidence.reliability import CALIBRATION, without_cut
+from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
 from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.inputs import (
     Observation,
@@ -206,18 +206,23 @@ def search_everywhere(
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)), confidence=confidence)
+    rivals = _rivals(problem, starts, origin)
     if seen.everything is not None:
         # In data of the whole clouds, each of those drawn stands for several.
         lead = lead * (seen.everything[1].sum(-1) / valid.sum(-1).clamp_min(1)).to(lead)
-    return FoundStarts(starts if clouds.ndim == 3 else starts.row(0), lead)
+    return FoundStarts(starts if clouds.ndim == 3 else starts.row(0), lead, rivals)
 
 
 @dataclass(frozen=True, eq=False)
 class FoundStarts:
-    """Starts, best first, and the cost (B,) by which the best of different poses is worse, or infinity."""
+    """Starts, best first, the cost (B,) by which the best of different poses is worse, or infinity, and rivals.
+
+    Rivals (B, S - 1, num_dofs) are those of the starts that explain nearly as much as the first; NaN elsewhere.
+    """
 
     starts: PoseStarts
     lead: Tensor
+    rivals: Tensor
 
 
 def _find(
@@ -282,6 +287,15 @@ def _lead(problem: AlignProblem, poses: Tensor, costs: Tensor) -> Tensor:
     """Return the cost (B,) by which the best of different poses is worse than the first, infinite without any."""
     apart = mean_distances(problem, poses)[:, 0] > _CANDIDATES.same * problem.size
     return torch.where(apart, costs, torch.inf).amin(1) - costs[:, 0]
+
+
+def _rivals(problem: AlignProblem, starts: PoseStarts, origin: Tensor) -> Tensor:
+    """Return the different starts after the first that explain nearly as much, in the world; see `FoundStarts`."""
+    apart = mean_distances(problem, shifted(starts.poses, -origin.unsqueeze(1))) > _CANDIDATES.same * problem.size
+    is_later = torch.ones_like(apart[0]).triu()
+    behind = starts.costs - starts.costs[:, :1]
+    is_rival = (apart | is_later).all(-1) & (behind < rival_margin(problem.valid.sum(-1)).unsqueeze(-1))
+    return torch.where(is_rival.unsqueeze(-1), starts.poses, torch.nan)[:, 1:]
 
 
 def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, lead: Tensor, count: int) -> PoseStarts:

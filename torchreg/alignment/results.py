@@ -77,12 +77,14 @@ class AlignResult(Result):
         dof_confidence: (num_dofs,) from 0 to 1, how well each degree of freedom is known: ``1 - var / var_0``, the
             share of its variance without data that is gone. ``var`` is that of the covariance, ``var_0`` that of the
             uniform distribution over the limits, at most the square of a radian, or of half the size where it slides.
+        rivals: (R, num_dofs) different poses that a search found to explain nearly as much, best first, such as that of
+            a box after half a turn; a batch has NaN where a cloud has fewer. None where a start was given.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "registered": "N 3", "keypoints": "K 3", "distances": "M", "inliers": "M", "posterior": "M",
         "sigma": "", "cost": "", "covariance": "D D", "confidence": "", "evidence": "E", "crop": "H W",
-        "coefficients": "C", "coefficient_covariance": "C C", "dof_confidence": "D",
+        "coefficients": "C", "coefficient_covariance": "C C", "dof_confidence": "D", "rivals": "R D",
     }  # fmt: skip
 
     pose: Tensor
@@ -106,6 +108,7 @@ class AlignResult(Result):
     shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
     up: tuple[float, float, float] | None = None
     dof_confidence: Tensor | None = None
+    rivals: Tensor | None = None
 
     @property
     def named_pose(self) -> dict[str, Any]:
@@ -141,6 +144,7 @@ class AlignResult(Result):
             registered=self.registered.double() + offset,
             keypoints=self.keypoints.double() + offset,
             history=tuple(replace(row, pose=shifted(row.pose.double(), offset)) for row in self.history),
+            rivals=None if self.rivals is None else shifted(self.rivals.double(), offset),
             origin=origin,
         )
 
@@ -150,7 +154,11 @@ class AlignResult(Result):
             return self
         found = replace(self.moved(-self.origin), origin=None)
         return replace(
-            found, pose=found.pose.to(like), registered=found.registered.to(like), keypoints=found.keypoints.to(like)
+            found,
+            pose=found.pose.to(like),
+            registered=found.registered.to(like),
+            keypoints=found.keypoints.to(like),
+            rivals=None if found.rivals is None else found.rivals.to(like),
         )
 
     def to_gltf(self, path: str | Path, source: str | Path, *, skin: str | int | None = None) -> Path:

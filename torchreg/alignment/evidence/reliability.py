@@ -26,7 +26,9 @@ from torchreg.alignment.fit.problem import AlignProblem, free_space_loss
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
+from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.limbs import Limb
+from torchreg.shapes.pose_algebra import BASE_DOFS
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +160,7 @@ def judge(
     lead: Tensor | None,
     error: SurfaceError | None = None,
     frames: Sequence[DepthFrame] = (),
+    rivals: Tensor | None = None,
 ) -> Judgement:
     """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`."""
     residuals = SurfaceResiduals.of(problem, pose)
@@ -184,7 +187,7 @@ def judge(
         confidence=confidence_of(evidence.table(), calibration),
         doubt=tuple(
             "; ".join(filter(None, row))
-            for row in zip(doubt_messages(problem, evidence, loose), left_open, strict=True)
+            for row in zip(doubt_messages(problem, evidence, loose, _turns(pose, rivals)), left_open, strict=True)
         ),
     )
 
@@ -206,6 +209,11 @@ def gather_evidence(
         intruding=free_space_loss(problem, pose),
         lead=lead,
     )
+
+
+def rival_margin(count: Tensor) -> Tensor:
+    """Return the cost (B,) by which another pose of a search may be worse and still count, for numbers (B,) of data."""
+    return (_SCALES.rival_share * count).clamp_min(EVIDENCE.lead)
 
 
 def weigh(
@@ -243,7 +251,20 @@ def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> T
     return torch.sigmoid(calibration.bias - evidence @ evidence.new_tensor(calibration.weights))
 
 
-def doubt_messages(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
+def _turns(pose: Tensor, rivals: Tensor | None) -> list[str]:
+    """Return by how much the base of rivals (B, R, num_dofs) is turned from that of poses, in words for each pose."""
+    if rivals is None:
+        return [""] * len(pose)
+    turn = so3_exp(rivals[..., 3:BASE_DOFS].nan_to_num()) @ so3_exp(pose[:, None, 3:BASE_DOFS]).mT
+    angles = so3_log(turn.flatten(0, 1)).norm(dim=-1).rad2deg().unflatten(0, turn.shape[:2])
+    words = [
+        ", ".join(f"{angle:.0f}" for angle in row[kept].tolist())
+        for row, kept in zip(angles, rivals.isfinite().all(-1), strict=True)
+    ]
+    return [f", its base turned by {row} deg" if row else "" for row in words]
+
+
+def doubt_messages(problem: AlignProblem, evidence: Evidence, loose: Tensor, rivals: Sequence[str]) -> tuple[str, ...]:
     """Return the doubts about poses, a sentence each, empty where there is none; loose (B, L) limbs are named."""
     limbs = [limb for limb, _ in limb_points(problem.skin)]
     sentences = []
@@ -253,7 +274,7 @@ def doubt_messages(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> 
         if unseen:
             reasons.append(f"hardly any data show where {', '.join(unseen)} end{'s' * (len(unseen) == 1)}")
         reasons += [
-            text.format(getattr(evidence, name)[row].item() ** 2)
+            text.format(getattr(evidence, name)[row].item() ** 2) + rivals[row] * (name == "rival")
             for name, limit, text in _REASONS
             if float(getattr(evidence, name)[row]) > limit
         ]
