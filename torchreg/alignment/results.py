@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from torchreg.alignment.evidence.assignment import assigned
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError
 from torchreg.geometry.loaded import as_points
@@ -134,6 +135,31 @@ class AlignResult(Result):
             data: as `align` was given it, one cloud or picture: of a whole picture the points of its crop are returned.
         """
         return as_points(data.cropped(self.crop) if self.crop is not None and isinstance(data, DepthFrame) else data)
+
+    def assignment(self, data: Any) -> Tensor:
+        """Return for each datum whether it is on the shape (2), on something that touches it (1), or elsewhere (0).
+
+        On the shape are the inliers. Something touches it, such as a forearm, a held box or a table, if neighbors
+        within three times the typical distance of data connect it to inliers.
+
+        Args:
+            data: the one cloud or picture that `align` was given; of a whole picture the points of its crop count.
+
+        Returns:
+            (M,) int64, in the order of `points_of`.
+
+        Raises:
+            InputError: if the data are not those of the result, or this is the result of a batch.
+
+        Differentiable: no. Cost: O(M log M).
+        """
+        points = self.points_of(data)
+        if points.shape[:-1] != self.inliers.shape or points.ndim != 2:
+            raise InputError(
+                f"data must be the one cloud that was aligned to, {tuple(self.inliers.shape)} points; got "
+                f"{tuple(points.shape[:-1])}"
+            )
+        return assigned(points, self.inliers.to(points.device))
 
     def moved(self, origin: Tensor) -> Self:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
