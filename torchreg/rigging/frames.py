@@ -73,10 +73,7 @@ def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) 
     if template in notes:
         raise InputError(f"template must be a frame that shows the thing; {notes[template]}")
     scans = [_double(as_scan(meshes[number], f"meshes[{number}]")) for number in kept]
-    if template is None:
-        chosen = _freest(scans)
-    else:
-        chosen = kept.index(template)
+    chosen = _freest(scans) if template is None else kept.index(template)
     faces = scans[chosen].faces
     if faces is None:
         raise InputError("one frame at least must be a mesh with triangles, which becomes the rig's surface")
@@ -86,7 +83,7 @@ def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) 
 
 
 def _freest(scans: Sequence[RangeScan]) -> int:
-    """Return the mesh of most surface: limbs that touch lose some, and so do holes; near its ties the middle frame."""
+    """Return the mesh of most surface: limbs that touch lose some, and so do holes."""
     areas = torch.tensor([
         0.0 if scan.faces is None else float(TriangleMesh(scan.points, scan.faces).face_areas().sum()) for scan in scans
     ])  # fmt: skip

@@ -93,6 +93,7 @@ def rig_sequence(
     count = config.num_bones if num_bones is None else num_bones
     check_count(count, "num_bones", 1)
     step = (lambda _: None) if on_step is None else on_step
+    meshes = list(meshes)
     frames = usable_frames(meshes, template, config.num_points)
     step("frames")
     found = register_sequence(
