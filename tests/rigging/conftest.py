@@ -16,13 +16,18 @@ QUICK = tr.RegisterConfig(align=replace(tr.RegisterConfig().align, num_samples=3
 CONFIG = tr.RigConfig(num_bones=6, num_points=700, register=QUICK)
 
 
-@pytest.fixture(scope="session")
-def arm():
+def bending_arm():
+    """Return an arm of two parts that bend at the origin."""
     parts = [
         Part("upper", None, (-0.5, 0.0, 0.0), (RoundCone((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.2, 0.2),)),
         Part("lower", "upper", (0.0, 0.0, 0.0), (RoundCone((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2, 0.12),)),
     ]
     return meshed_figure(parts, spacing=0.04, blend=0.05, softness=0.05)
+
+
+@pytest.fixture(scope="session")
+def arm():
+    return bending_arm()
 
 
 def posed(figure, angle):

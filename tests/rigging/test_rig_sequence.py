@@ -9,6 +9,7 @@ import torch
 import torchreg as tr
 from tests.rigging.conftest import ANGLES, CONFIG, anew, posed
 from torchreg.errors import FramesWarning
+from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.neighbors import nearest_neighbor
 
 
@@ -91,3 +92,26 @@ def test_a_frame_may_be_a_cloud(arm, frames):
     found = tr.rig_sequence([frames[0], cloud], config=CONFIG)
     assert found.template == 0
     assert float(found.errors[1]) < 0.015
+
+
+def test_another_thing_in_between_spoils_no_other_frame(frames):
+    size = float((frames[1].vertices.amax(0) - frames[1].vertices.amin(0)).norm())
+    ball = unit_sphere(4)
+    foreign = tr.TriangleMesh(ball.vertices * torch.tensor([0.1, 0.3, 0.3]) * size, ball.faces)
+    with pytest.warns(FramesWarning, match="frame 2: left out: the rig's surface is"):
+        found = tr.rig_sequence([*frames[:2], foreign, *frames[2:]], template=0, config=CONFIG)
+    assert found.status is tr.Status.WITH_WARNINGS
+    assert found.poses.isfinite().all(1).tolist() == [True, True, False, True, True]
+    assert float(found.errors[[0, 1, 3, 4]].max()) < 0.01
+    assert float(found.confidence[2]) < 0.2
+
+
+def test_a_scan_from_one_side_is_enough_after_a_whole_frame(frames, rig):
+    mesh = frames[2]
+    shown = mesh.face_normals()[:, 2] > 0
+    used = mesh.faces[shown].unique()
+    place = torch.full((mesh.num_vertices,), -1).index_copy(0, used, torch.arange(len(used)))
+    half = tr.TriangleMesh(mesh.vertices[used], place[mesh.faces[shown]])
+    found = tr.rig_sequence([frames[0], frames[1], half], template=0, config=CONFIG)
+    assert found.status.usable
+    assert float((found.vertices()[2] - rig.vertices()[2]).norm(dim=-1).mean()) < 0.08

@@ -31,7 +31,7 @@ class RigConfig:
     rounds: int = 16
     width: tuple[float, float] = (0.05, 0.01)
     along: float = 0.1
-    stay: float = 0.002
+    stay: float = 0.0006
     doubtful: float = 0.025
     register: RegisterConfig = field(default_factory=RegisterConfig)
 

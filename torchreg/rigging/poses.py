@@ -78,8 +78,11 @@ class SurfaceFitter:
         points, normals = self.skin(pose), self.skin.posed_normals(pose)
         index, back = target.match(points, normals)
         there = surface_distances(points - target.points[index], target.normals[index], target.spacing)
+        there = there[target.inside[index]]
         here = surface_distances(target.points - points[back], normals[back], target.spacing)
-        return float(there.mean() + here.mean()) / 2 / self.size
+        # A scan of nothing but borders shows how far it is from the rig, not the rig from it.
+        parts = [part.mean() for part in (there, here) if len(part)]
+        return float(sum(parts)) / len(parts) / self.size
 
     def _linearized(self, target: _Target, pose: Tensor, neighbor: Tensor, width: float) -> Linearization:
         """Return matches both ways at a pose (D,) as one least-squares problem, and the pull of the neighbor."""
@@ -90,9 +93,10 @@ class SurfaceFitter:
         data = torch.cat((index, torch.arange(len(target.points))))
         residual = (points[model] - target.points[data]) / self.size
         weight = welsch_weight(residual.square().sum(-1) * (self.size / width) ** 2)
-        weight = weight / torch.cat(
-            (weight.new_full((len(index),), len(index)), weight.new_full((len(back),), len(back)))
-        )
+        sizes = torch.tensor([len(index), len(back)]).repeat_interleave(torch.tensor([len(index), len(back)]))
+        # Beyond the border of a scan the surface goes on unseen.
+        seen = torch.cat((target.inside[index], target.inside.new_ones(len(back))))
+        weight = weight * seen / sizes
         direction = target.normals[data]
         along = self.config.along
         # Sums over the matches of each model point make the product with the Jacobian small.
@@ -107,9 +111,8 @@ class SurfaceFitter:
         flat = scaled.reshape(-1, scaled.shape[-1])
         hessian = flat.mT @ (metrics @ scaled).reshape(flat.shape)
         gradient = flat.mT @ pulls.reshape(-1)
-        stay = self.config.stay**2
         joints = torch.zeros_like(pose)
-        joints[BASE_DOFS:] = stay / 10
+        joints[BASE_DOFS:] = self.config.stay**2
         gradient = gradient + joints * difference(neighbor, pose)
         hessian = hessian + torch.diag(joints)
         return Linearization(gradient.new_zeros(1), gradient[None], hessian[None])
@@ -117,10 +120,11 @@ class SurfaceFitter:
 
 @dataclass(frozen=True)
 class _Target:
-    """A scan's points and normals (M, 3), and a tree of both."""
+    """A scan's points and normals (M, 3), whether they are inside its border (M,), and a tree of points and normals."""
 
     points: Tensor
     normals: Tensor
+    inside: Tensor
     spacing: float
     reach: float
     tree: NeighborTree
@@ -129,7 +133,7 @@ class _Target:
     def of(cls, scan: RangeScan, size: float) -> _Target:
         reach = _NORMAL_REACH * size
         tree = NeighborTree(torch.cat((scan.points, reach * scan.normals), 1))
-        return cls(scan.points, scan.normals, scan.spacing, reach, tree)
+        return cls(scan.points, scan.normals, ~scan.boundary, scan.spacing, reach, tree)
 
     def match(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Return the target's nearest point (N,) of each model point, and the model's (M,) of each of the target."""

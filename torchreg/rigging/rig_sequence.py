@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,8 @@ from torchreg.rigging.results import SequenceRig
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
+# Called with the name of the stage that a step belongs to.
+OnStep = Callable[[str], None]
 # Weights of a vertex, as file formats keep them.
 _MOST_WEIGHTS = 4
 # Cells along the longest side of the grid on which weights live.
@@ -52,7 +54,7 @@ def rig_sequence(
     num_bones: int | None = None,
     config: RigConfig | None = None,
     up: Direction | None = None,
-    on_step: Callable[[str], None] | None = None,
+    on_step: OnStep | None = None,
 ) -> SequenceRig:
     """Return one skinned shape and its poses from meshes of one moving thing that share neither vertices nor faces.
 
@@ -96,17 +98,31 @@ def rig_sequence(
     meshes = list(meshes)
     frames = usable_frames(meshes, template, config.num_points)
     step("frames")
+    rows = list(range(len(frames.scans)))
+    shape, poses, errors = _rigged(frames, rows, count, config, up, step)
+    good = errors <= config.doubtful
+    if len(rows) // 2 < int(good.sum()) < len(rows):
+        # Another thing in between spoils what follows it; the rig of the others tells which frames those are.
+        shape, poses, errors = _rigged(frames, good.nonzero()[:, 0].tolist(), count, config, up, step)
+    return _result(shape, poses, errors, frames, len(meshes), config, up)
+
+
+def _rigged(
+    frames: RigFrames, rows: list[int], count: int, config: RigConfig, up: Direction | None, step: OnStep
+) -> tuple[ArticulatedShape, Tensor, Tensor]:
+    """Return the rig of some frames, poses (T, D) of all that are used, and their errors (T,)."""
     found = register_sequence(
-        frames.scans, count, _GRID, config.register, on_step=lambda record: step(record.stage),
-        reference=frames.template,
+        [frames.scans[row] for row in rows], count, _GRID, config.register,
+        on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
     )  # fmt: skip
     bones = _bones(found, frames)
     shape = ArticulatedShape.from_skinned_mesh(
         frames.mesh.vertices, frames.mesh.faces, bones.weights, bones.joints, bones.parents,
         joint_names=bones.names, up=Y_UP if up is None else up, dtype=torch.float64,
     )  # fmt: skip
-    poses, errors = _fitted_poses(shape, bones, frames, config, step)
-    return _result(shape, poses, errors, frames, len(meshes), config, up)
+    starts = dict(zip(rows, poses_of_motions(shape, bones.names, bones.parents, bones.motions), strict=True))
+    poses, errors = _fitted_poses(shape, starts, frames, config, step)
+    return shape, poses, errors
 
 
 def _bones(found: SequenceRegistration, frames: RigFrames) -> _Bones:
@@ -147,24 +163,26 @@ def _below(root: int, parents: dict[int, int]) -> list[int]:
 
 
 def _fitted_poses(
-    shape: ArticulatedShape, bones: _Bones, frames: RigFrames, config: RigConfig, step: Callable[[str], None]
+    shape: ArticulatedShape, starts: Mapping[int, Tensor], frames: RigFrames, config: RigConfig, step: OnStep
 ) -> tuple[Tensor, Tensor]:
-    """Return poses (T, D) of the used frames and their errors (T,), from the template outward."""
-    skin = _coarse_skin(shape, frames.scans[frames.template], config)
-    size = float(frames.scans[frames.template].diagonal)
-    fitter = SurfaceFitter(skin, size, config)
-    poses = poses_of_motions(shape, bones.names, bones.parents, bones.motions)
+    """Return poses (T, D) of all frames and their errors (T,), from the template outward, from starts of some."""
+    fitter = SurfaceFitter(
+        _coarse_skin(shape, frames.scans[frames.template]), float(frames.scans[frames.template].diagonal), config
+    )
+    poses = shape.rest_pose().repeat(len(frames.scans), 1)
     errors = poses.new_zeros(len(poses))
-    poses[frames.template] = shape.rest_pose()
     for direction, end in ((1, len(poses)), (-1, -1)):
+        neighbor = poses[frames.template]
         for frame in range(frames.template + direction, end, direction):
-            best = fitter.fit(frames.scans[frame], [poses[frame], poses[frame - direction]])
+            best = fitter.fit(frames.scans[frame], [*([starts[frame]] if frame in starts else []), neighbor])
             poses[frame], errors[frame] = best.pose, best.error
+            if best.error <= config.doubtful:
+                neighbor = poses[frame]
             step("poses")
     return poses, errors
 
 
-def _coarse_skin(shape: ArticulatedShape, scan: RangeScan, config: RigConfig) -> LinearBlendSkin:
+def _coarse_skin(shape: ArticulatedShape, scan: RangeScan) -> LinearBlendSkin:
     """Return the skin of a coarse template scan, whose points are vertices of the rig's surface."""
     full = shape.file_skin()
     index, _ = nearest_neighbor(scan.points, full.points)
@@ -177,9 +195,10 @@ def _result(
 ) -> SequenceRig:  # fmt: skip
     """Return the rig with the frames that were left out, and a sentence for each that is not explained."""
     numbers = list(frames.numbers)
-    doubtful = errors > config.doubtful
+    doubtful, foreign = errors > config.doubtful, errors > 2 * config.doubtful
     notes = [
-        f"frame {numbers[row]}: not explained: the rig's surface is {100 * float(errors[row]):.2g} % of its size away"
+        f"frame {numbers[row]}: {'left out' if foreign[row] else 'doubtful'}: the rig's surface is "
+        f"{100 * float(errors[row]):.2g} % of its size away: another thing, or limbs that touch"
         for row in doubtful.nonzero()[:, 0].tolist()
     ]
     notes = sorted([*frames.notes, *notes], key=lambda note: int(note.split(":")[0].removeprefix("frame ")))
@@ -187,10 +206,10 @@ def _result(
         warnings.warn("; ".join(notes), FramesWarning, stacklevel=4)
     all_poses = poses.new_full((count, poses.shape[1]), torch.nan)
     all_errors, confidence = errors.new_full((count,), torch.nan), errors.new_zeros(count)
-    all_poses[numbers], all_errors[numbers] = poses, errors
+    all_poses[numbers], all_errors[numbers] = poses.masked_fill(foreign[:, None], torch.nan), errors
     confidence[numbers] = (1 + (errors / config.doubtful) ** 2).reciprocal()
     status = Status.WITH_WARNINGS if notes else Status.CONVERGED
-    if bool(doubtful.any()):
+    if bool((doubtful & ~foreign).any()) or 2 * int(foreign.sum()) >= len(errors):
         status = Status.DOUBTFUL
     skin = shape.file_skin()
     return SequenceRig(
