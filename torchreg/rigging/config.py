@@ -19,6 +19,7 @@ class RigConfig:
         width: distances at which a match counts less, in the first round and in the last.
         along: weight of a match along the surface, where vertices of different meshes do not correspond.
         stay: how far a turn by one radian from the neighbor in time counts, as a distance.
+        alike: bones of one joint are one where the motion of either leaves the other's points that near, on average.
         doubtful: mean distance from the surface above which a frame is not explained.
         register: of the scan registration that finds bones.
 
@@ -32,6 +33,7 @@ class RigConfig:
     width: tuple[float, float] = (0.05, 0.01)
     along: float = 0.1
     stay: float = 0.0006
+    alike: float = 0.008
     doubtful: float = 0.025
     register: RegisterConfig = field(default_factory=RegisterConfig)
 
@@ -40,4 +42,5 @@ class RigConfig:
             check_count(getattr(self, name), name, 1)
         for name, value in (("width", min(self.width)), ("along", self.along), ("doubtful", self.doubtful)):
             check_positive(value, name)
-        check_positive(self.stay, "stay", allow_zero=True)
+        for name in ("stay", "alike"):
+            check_positive(getattr(self, name), name, allow_zero=True)

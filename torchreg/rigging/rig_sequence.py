@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,8 +16,8 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.upright import Y_UP, Direction
 from torchreg.registration.register_sequence import register_sequence
-from torchreg.registration.results import SequenceRegistration
 from torchreg.result import Status
+from torchreg.rigging.bones import tree_of_bones
 from torchreg.rigging.config import RigConfig
 from torchreg.rigging.frames import RigFrames, usable_frames
 from torchreg.rigging.poses import SurfaceFitter, poses_of_motions
@@ -28,21 +27,8 @@ from torchreg.shapes.skin import LinearBlendSkin
 
 # Called with the name of the stage that a step belongs to.
 OnStep = Callable[[str], None]
-# Weights of a vertex, as file formats keep them.
-_MOST_WEIGHTS = 4
 # Cells along the longest side of the grid on which weights live.
 _GRID = 50
-
-
-@dataclass(frozen=True)
-class _Bones:
-    """A tree of B bones: weights (V, B) of the template's vertices, motions (T, B, 4, 4), joints (B, 3), parents."""
-
-    weights: Tensor
-    motions: Tensor
-    joints: Tensor
-    parents: tuple[int, ...]
-    names: tuple[str, ...]
 
 
 @torch.no_grad()
@@ -115,7 +101,7 @@ def _rigged(
         [frames.scans[row] for row in rows], count, _GRID, config.register,
         on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
     )  # fmt: skip
-    bones = _bones(found, frames)
+    bones = tree_of_bones(found, frames.mesh.vertices, config.alike)
     shape = ArticulatedShape.from_skinned_mesh(
         frames.mesh.vertices, frames.mesh.faces, bones.weights, bones.joints, bones.parents,
         joint_names=bones.names, up=Y_UP if up is None else up, dtype=torch.float64,
@@ -123,43 +109,6 @@ def _rigged(
     starts = dict(zip(rows, poses_of_motions(shape, bones.names, bones.parents, bones.motions), strict=True))
     poses, errors = _fitted_poses(shape, starts, frames, config, step)
     return shape, poses, errors
-
-
-def _bones(found: SequenceRegistration, frames: RigFrames) -> _Bones:
-    """Return the bones that move vertices of the template, as one tree."""
-    weights = found.model.vertex_weights(frames.mesh.vertices, most=_MOST_WEIGHTS).double()
-    tree = found.model.skeleton(found.transforms)
-    kept = [bone for bone in range(weights.shape[1]) if float(weights[:, bone].sum()) > 0]
-    parents = {bone: _kept_parent(bone, tree.parents, kept) for bone in kept}
-    roots = [bone for bone in kept if parents[bone] < 0]
-    main = max(roots, key=lambda root: float(weights[:, _below(root, parents)].sum()))
-    parents.update({root: main for root in roots if root != main})
-    place = {bone: number for number, bone in enumerate(kept)}
-    return _Bones(
-        weights=weights[:, kept] / weights[:, kept].sum(-1, keepdim=True),
-        motions=found.transforms[:, kept].double(),
-        joints=tree.origins[kept].double(),
-        parents=tuple(place.get(parents[bone], -1) for bone in kept),
-        names=tuple(f"bone_{number}" for number in range(len(kept))),
-    )
-
-
-def _kept_parent(bone: int, parents: Sequence[int], kept: Sequence[int]) -> int:
-    parent = parents[bone]
-    while parent >= 0 and parent not in kept:
-        parent = parents[parent]
-    return parent
-
-
-def _below(root: int, parents: dict[int, int]) -> list[int]:
-    """Return the bones of a root's tree."""
-
-    def top(bone: int) -> int:
-        while parents[bone] >= 0:
-            bone = parents[bone]
-        return bone
-
-    return [bone for bone in parents if top(bone) == root]
 
 
 def _fitted_poses(
