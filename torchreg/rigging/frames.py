@@ -15,6 +15,7 @@ from torchreg.geometry.loaded import as_points, as_scan
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.scan_clusters import clustered_scan
+from torchreg.rigging.distances import SurfaceSamples
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class RigFrames:
 
     Args:
         scans: coarse, double precision.
+        surfaces: even samples of each, from which distances are measured.
         numbers: of the scans among all frames.
         template: index among the scans.
         mesh: of the template, as it was given.
@@ -41,6 +43,7 @@ class RigFrames:
     """
 
     scans: tuple[RangeScan, ...]
+    surfaces: tuple[SurfaceSamples, ...]
     numbers: tuple[int, ...]
     template: int
     mesh: TriangleMesh
@@ -79,7 +82,8 @@ def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) 
         raise InputError("one frame at least must be a mesh with triangles, which becomes the rig's surface")
     coarse = tuple(clustered_scan(scan, num_points)[0] for scan in scans)
     mesh = TriangleMesh(scans[chosen].points, faces)
-    return RigFrames(coarse, tuple(kept), chosen, mesh, tuple(notes.values()))
+    surfaces = tuple(SurfaceSamples.of_scan(scan) for scan in scans)
+    return RigFrames(coarse, surfaces, tuple(kept), chosen, mesh, tuple(notes.values()))
 
 
 def _freest(scans: Sequence[RangeScan]) -> int:

@@ -12,6 +12,7 @@ from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rotation import so3_log
 from torchreg.rigging.config import RigConfig
+from torchreg.rigging.distances import surface_distances
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
 from torchreg.shapes.skin import LinearBlendSkin
@@ -140,13 +141,3 @@ class _Target:
         both = torch.cat((points, self.reach * normals), 1)
         own = torch.cat((self.points, self.reach * self.normals), 1)
         return self.tree.nearest(both)[0], NeighborTree(both).nearest(own)[0]
-
-
-def surface_distances(offsets: Tensor, normals: Tensor, spacing: float) -> Tensor:
-    """Return distances (N,) from a surface known by samples: offsets (N, 3) from the nearest, less what lies between.
-
-    Within a spacing of the sample the surface goes on along its tangent plane.
-    """
-    height = (offsets * normals).sum(-1)
-    beside = (offsets - height[:, None] * normals).norm(dim=-1)
-    return (height.square() + (beside - spacing).clamp_min(0).square()).sqrt()

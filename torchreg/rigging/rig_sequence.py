@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg._checks import check_count
 from torchreg._threads import one_thread
 from torchreg.errors import FramesWarning
+from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.upright import Y_UP, Direction
@@ -19,6 +20,7 @@ from torchreg.registration.register_sequence import register_sequence
 from torchreg.result import Status
 from torchreg.rigging.bones import tree_of_bones
 from torchreg.rigging.config import RigConfig
+from torchreg.rigging.distances import SurfaceSamples, two_way_distance
 from torchreg.rigging.frames import RigFrames, usable_frames
 from torchreg.rigging.poses import SurfaceFitter, poses_of_motions
 from torchreg.rigging.results import SequenceRig
@@ -115,27 +117,29 @@ def _fitted_poses(
     shape: ArticulatedShape, starts: Mapping[int, Tensor], frames: RigFrames, config: RigConfig, step: OnStep
 ) -> tuple[Tensor, Tensor]:
     """Return poses (T, D) of all frames and their errors (T,), from the template outward, from starts of some."""
-    fitter = SurfaceFitter(
-        _coarse_skin(shape, frames.scans[frames.template]), float(frames.scans[frames.template].diagonal), config
-    )
+    size, skin = float(frames.scans[frames.template].diagonal), shape.file_skin()
+    fitter = SurfaceFitter(_coarse_skin(skin, frames.scans[frames.template]), size, config)
     poses = shape.rest_pose().repeat(len(frames.scans), 1)
     errors = poses.new_zeros(len(poses))
     for direction, end in ((1, len(poses)), (-1, -1)):
         neighbor = poses[frames.template]
         for frame in range(frames.template + direction, end, direction):
             best = fitter.fit(frames.scans[frame], [*([starts[frame]] if frame in starts else []), neighbor])
-            poses[frame], errors[frame] = best.pose, best.error
-            if best.error <= config.doubtful:
+            rig = SurfaceSamples.of_mesh(TriangleMesh(skin(best.pose), frames.mesh.faces))
+            poses[frame] = best.pose
+            errors[frame] = two_way_distance(rig, frames.surfaces[frame], frames.scans[frame]) / size
+            if errors[frame] <= config.doubtful:
                 neighbor = poses[frame]
             step("poses")
     return poses, errors
 
 
-def _coarse_skin(shape: ArticulatedShape, scan: RangeScan) -> LinearBlendSkin:
+def _coarse_skin(full: LinearBlendSkin, scan: RangeScan) -> LinearBlendSkin:
     """Return the skin of a coarse template scan, whose points are vertices of the rig's surface."""
-    full = shape.file_skin()
     index, _ = nearest_neighbor(scan.points, full.points)
-    return LinearBlendSkin(shape, full.points[index], full.weights[index], full.reference_pose, normals=scan.normals)
+    return LinearBlendSkin(
+        full.shape, full.points[index], full.weights[index], full.reference_pose, normals=scan.normals
+    )
 
 
 def _result(
