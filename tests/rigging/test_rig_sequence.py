@@ -11,6 +11,7 @@ from tests.rigging.conftest import ANGLES, CONFIG, anew, posed
 from torchreg.errors import FramesWarning
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.rotation import so3_exp
 
 
 def test_the_rig_follows_the_true_surface_and_bends_at_the_true_joint(arm, frames, rig):
@@ -115,3 +116,15 @@ def test_a_scan_from_one_side_is_enough_after_a_whole_frame(frames, rig):
     found = tr.rig_sequence([frames[0], frames[1], half], template=0, config=CONFIG)
     assert found.status.usable
     assert float((found.vertices()[2] - rig.vertices()[2]).norm(dim=-1).mean()) < 0.08
+
+
+def test_a_rigid_thing_is_one_bone_with_a_sentence(frames, tmp_path):
+    turned = so3_exp(torch.tensor([0.0, 0.3, 0.1])).to(frames[1].vertices)
+    moved = tr.TriangleMesh(frames[1].vertices @ turned.mT + 0.1, frames[1].faces)
+    with pytest.warns(FramesWarning, match="nothing bends in these frames"):
+        found = tr.rig_sequence([frames[1], moved], config=CONFIG)
+    assert found.weights.shape[1] == 1
+    assert found.status is tr.Status.WITH_WARNINGS
+    assert float(found.errors.max()) < 1e-3
+    assert found.to_bvh(tmp_path / "one.bvh").exists()
+    assert found.to_gltf(tmp_path / "one.glb").exists()

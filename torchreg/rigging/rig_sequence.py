@@ -70,7 +70,7 @@ def rig_sequence(
         InputTypeError: if a frame is neither mesh, scan nor cloud.
 
     Warns:
-        FramesWarning: if frames are left out, or not explained by the rig.
+        FramesWarning: if frames are left out or not explained by the rig, or nothing bends.
 
     Differentiable: no.
 
@@ -155,6 +155,8 @@ def _result(
         for row in doubtful.nonzero()[:, 0].tolist()
     ]
     notes = sorted([*frames.notes, *notes], key=lambda note: int(note.split(":")[0].removeprefix("frame ")))
+    if shape.num_parts == 1:
+        notes.append("nothing bends in these frames: the rig is one bone, which a round thing or a rigid one needs")
     if notes:
         warnings.warn("; ".join(notes), FramesWarning, stacklevel=4)
     all_poses = poses.new_full((count, poses.shape[1]), torch.nan)
