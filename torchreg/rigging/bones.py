@@ -12,8 +12,15 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.registration.results import SequenceRegistration
 from torchreg.solvers.rigid_groups import merge_alike
 
-# Weights of a vertex, as file formats keep them.
-_MOST_WEIGHTS = 4
+
+@dataclass(frozen=True)
+class _Format:
+    """What files keep."""
+
+    most_weights: int = 4  # of a vertex
+
+
+_FORMAT = _Format()
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,6 @@ def _parents_first(parents: Sequence[int]) -> list[int]:
 
 def _largest(weights: Tensor) -> Tensor:
     """Return weights (V, B) with as many of the largest as files keep, rows summing to one."""
-    values, index = weights.topk(min(_MOST_WEIGHTS, weights.shape[1]), dim=1)
+    values, index = weights.topk(min(_FORMAT.most_weights, weights.shape[1]), dim=1)
     kept = torch.zeros_like(weights).scatter(1, index, values)
     return kept / kept.sum(1, keepdim=True)

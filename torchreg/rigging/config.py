@@ -15,6 +15,7 @@ class RigConfig:
     Args:
         num_bones: most bones where the call gives no number.
         num_points: points to which frames are reduced before they are registered; limbs of one percent keep some.
+        cells: of the grid on which weights live, along the longest side.
         rounds: matches of a frame's surface with the rig's, and steps of its pose.
         width: distances at which a match counts less, in the first round and in the last.
         along: weight of a match along the surface, where vertices of different meshes do not correspond.
@@ -29,6 +30,7 @@ class RigConfig:
 
     num_bones: int = 24
     num_points: int = 3000
+    cells: int = 50
     rounds: int = 16
     width: tuple[float, float] = (0.05, 0.01)
     along: float = 0.1
@@ -38,7 +40,7 @@ class RigConfig:
     register: RegisterConfig = field(default_factory=RegisterConfig)
 
     def __post_init__(self) -> None:
-        for name in ("num_bones", "num_points", "rounds"):
+        for name in ("num_bones", "num_points", "cells", "rounds"):
             check_count(getattr(self, name), name, 1)
         for name, value in (("width", min(self.width)), ("along", self.along), ("doubtful", self.doubtful)):
             check_positive(value, name)

@@ -11,8 +11,15 @@ from torchreg.geometry.mesh import TriangleMesh, even_samples
 from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.range_scan import RangeScan
 
-# Samples of a surface: a mean over them is known to a hundredth of itself.
-_NUM_SAMPLES = 8000
+
+@dataclass(frozen=True)
+class _Sampling:
+    """Samples of a surface."""
+
+    count: int = 8000  # a mean over them is known to a hundredth of itself
+
+
+_SAMPLING = _Sampling()
 
 
 @dataclass(frozen=True)
@@ -26,16 +33,16 @@ class SurfaceSamples:
     @classmethod
     def of_mesh(cls, mesh: TriangleMesh) -> SurfaceSamples:
         """Return samples of a mesh."""
-        points, face = even_samples(mesh, _NUM_SAMPLES)
+        points, face = even_samples(mesh, _SAMPLING.count)
         area = float(mesh.face_areas().sum())
-        return cls(points, mesh.face_normals()[face], (area / _NUM_SAMPLES) ** 0.5)
+        return cls(points, mesh.face_normals()[face], (area / _SAMPLING.count) ** 0.5)
 
     @classmethod
     def of_scan(cls, scan: RangeScan) -> SurfaceSamples:
         """Return samples of a scan: of its triangles, or its points."""
         if scan.faces is not None:
             return cls.of_mesh(TriangleMesh(scan.points, scan.faces))
-        index = scan.uniform_subsample(min(len(scan), _NUM_SAMPLES))
+        index = scan.uniform_subsample(min(len(scan), _SAMPLING.count))
         return cls(scan.points[index], scan.normals[index], sampling_distance(scan.points[index]))
 
     def distances(self, points: Tensor) -> Tensor:

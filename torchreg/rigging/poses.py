@@ -19,9 +19,16 @@ from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization, damped_step
 from torchreg.solvers.robust import welsch_weight
 
-# Distance, in diagonals, that normals at a right angle count as: surfaces back to back must not match.
-_NORMAL_REACH = 0.05
-_DAMPING = 1e-3
+
+@dataclass(frozen=True)
+class _Matching:
+    """Numbers of matches between surfaces."""
+
+    normal_reach: float = 0.05  # diagonals that normals a unit apart count as: surfaces back to back must not match
+    damping: float = 1e-3  # relative, of a Gauss-Newton step: bones that no match holds must not turn far
+
+
+_MATCHING = _Matching()
 
 
 def poses_of_motions(shape: ArticulatedShape, names: Sequence[str], parents: Sequence[int], motions: Tensor) -> Tensor:
@@ -70,7 +77,7 @@ class SurfaceFitter:
         for number in range(config.rounds):
             width = first * (last / first) ** (number / max(1, config.rounds - 1))
             problem = self._linearized(target, pose, neighbor.double(), width * self.size)
-            step, _ = damped_step(problem, pose.new_full((1,), _DAMPING))
+            step, _ = damped_step(problem, pose.new_full((1,), _MATCHING.damping))
             pose = retract(pose, step[0])
         return FittedPose(pose, self.error(target, pose))
 
@@ -132,7 +139,7 @@ class _Target:
 
     @classmethod
     def of(cls, scan: RangeScan, size: float) -> _Target:
-        reach = _NORMAL_REACH * size
+        reach = _MATCHING.normal_reach * size
         tree = NeighborTree(torch.cat((scan.points, reach * scan.normals), 1))
         return cls(scan.points, scan.normals, ~scan.boundary, scan.spacing, reach, tree)
 

@@ -29,8 +29,6 @@ from torchreg.shapes.skin import LinearBlendSkin
 
 # Called with the name of the stage that a step belongs to.
 OnStep = Callable[[str], None]
-# Cells along the longest side of the grid on which weights live.
-_GRID = 50
 
 
 @torch.no_grad()
@@ -100,7 +98,7 @@ def _rigged(
 ) -> tuple[ArticulatedShape, Tensor, Tensor]:
     """Return the rig of some frames, poses (T, D) of all that are used, and their errors (T,)."""
     found = register_sequence(
-        [frames.scans[row] for row in rows], count, _GRID, config.register,
+        [frames.scans[row] for row in rows], count, config.cells, config.register,
         on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
     )  # fmt: skip
     bones = tree_of_bones(found, frames.mesh.vertices, config.alike)
