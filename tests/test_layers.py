@@ -28,6 +28,7 @@ LAYERS = [
     {"datasets", "spines", "registration"},
     {"alignment"},
     {"tracking"},
+    {"rigging"},
     {"storage", "viz"},
     {"cli"},
     {"__init__", "__main__"},

@@ -59,6 +59,9 @@ from torchreg.registration.results import SequenceRegistration as SequenceRegist
 from torchreg.registration.solve_pose import SolvePoseConfig as SolvePoseConfig
 from torchreg.registration.solve_pose import solve_pose as solve_pose
 from torchreg.result import Status as Status
+from torchreg.rigging.config import RigConfig as RigConfig
+from torchreg.rigging.results import SequenceRig as SequenceRig
+from torchreg.rigging.rig_sequence import rig_sequence as rig_sequence
 from torchreg.shapes.articulated import ArticulatedShape as ArticulatedShape
 from torchreg.shapes.hand import Hand as Hand
 from torchreg.shapes.material_points import ShapeOutput as ShapeOutput
@@ -118,10 +121,12 @@ __all__ = [
     "RangeScan",
     "RegisterConfig",
     "RegistrationEnergy",
+    "RigConfig",
     "ScanMatcher",
     "ScanMatches",
     "ScanRegistration",
     "SequenceRegistration",
+    "SequenceRig",
     "ShapeOutput",
     "SigmaSchedule",
     "SilhouetteFrames",
@@ -165,6 +170,7 @@ __all__ = [
     "plot",
     "register",
     "register_sequence",
+    "rig_sequence",
     "sample_skin",
     "skeletonize",
     "solve_pose",

@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 import torchreg as tr
+from tests.rigging.conftest import bending_arm, posed
 from torchreg.io.gltf_write import save_animated_skin
 
 
@@ -317,3 +318,15 @@ def test_reading_is_timed(load, capsys, monkeypatch):
     printed = capsys.readouterr().out
     assert all(f"500 points .{ending}: torchreg" in printed for ending in ("ply", "xyz", "csv", "npz"))
     assert printed.endswith("rigs None\n")
+
+
+def test_a_rig_of_a_sequence_is_nearer_than_what_stands_still(load, tmp_path, capsys):
+    arm = bending_arm()
+    stored = torch.stack([posed(arm, angle) for angle in (0.0, 0.4, 0.8)])
+    np.savez(tmp_path / "arm.npz", vertices=stored.numpy(), faces=arm.mesh.faces.numpy())
+    load("rig_sequence").main(["--data", str(tmp_path), "--captured", "arm"])
+    (row,) = capsys.readouterr().out.splitlines()
+    moved, still = (float(re.search(rf"{word} +([\d.]+)%", row)[1]) for word in ("rig", "still"))
+    assert moved < 0.3 * still
+    load("rig_sequence").main([])
+    assert "--data" in capsys.readouterr().out

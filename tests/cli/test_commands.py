@@ -27,7 +27,7 @@ finally:
     print(*sorted({"torch", "numpy", "scipy", "matplotlib"} & sys.modules.keys()), file=sys.stderr)
 """
 COMMANDS = typer.main.get_command(app).commands
-NAMES = ("align", "calibrate", "demo", "export", "figure", "formats", "info", "label", "pose", "register", "spine",
+NAMES = ("align", "calibrate", "demo", "export", "figure", "formats", "info", "label", "pose", "register", "rig", "spine",
          "track", "train-initializer", "view")  # fmt: skip
 # What may be given twice where there is a source and a target, and how a track names its movie in one word.
 TWICE, WORDS = {"--scale", "--time", "--frame", "--intrinsics", "--data"}, {"--movie"}
@@ -75,7 +75,7 @@ def test_an_option_is_of_one_kind_and_has_one_help_everywhere():
         assert len({item.multiple for item in items.values()}) == 1 or name in TWICE, name
     for name in ("--up", "--force", "--quiet", "--seen", "--mask", "--depth", "--port", "--scale", "--nan-policy"):
         assert len({item.help for item in OPTIONS[name].values() if not item.multiple}) == 1, name
-    assert set(OPTIONS["--up"]) == {"align", "track", "register", "spine", "pose", "view", "export"}
+    assert set(OPTIONS["--up"]) == {"align", "track", "register", "rig", "spine", "pose", "view", "export"}
     for command in ("align", "register", "spine"):
         assert command in OPTIONS["--scale"]
         assert command in OPTIONS["--nan-policy"]

@@ -20,6 +20,7 @@ from torchreg.cli.label import label
 from torchreg.cli.near_options import Command
 from torchreg.cli.pose import pose
 from torchreg.cli.register import register
+from torchreg.cli.rig import rig
 from torchreg.cli.spine import spine
 from torchreg.cli.track import track
 from torchreg.cli.train_initializer import train_initializer
@@ -82,6 +83,8 @@ _COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
      ("pose moved.safetensors", "pose moved.safetensors --handle 0.1,0,2 --to 0.2,0,2 -o posed.ply")),
     (register, "Register two range scans of something that moves.",
      ("register a.ply b.ply -o moved.glb", "register --depth a.png b.png --intrinsics camera.json")),
+    (rig, "Make a rig with a clip from a sequence of meshes.",
+     ("rig meshes/ -o creature.glb", "rig meshes/*.obj --template 3 --bones 12")),
     (track, "Follow a shape through a sequence of clouds.",
      ("track hand frames/ -o moving",
       "track hand depth/ --depth --intrinsics camera.json")),

@@ -248,6 +248,12 @@ def _spine_movie(path: Path, source: Source) -> None:
     save_spine_movie(path, source.result, source.data, fps=source.fps)
 
 
+def _rig_motion(path: Path, source: Source) -> None:
+    """Write the rig and its clip as glTF, or its motion as BVH."""
+    rig = source.result
+    (rig.to_gltf if path.suffix.lower() == ".glb" else rig.to_bvh)(path, fps=source.fps, up=source.direction)
+
+
 def _scan_ply(path: Path, source: Source) -> None:
     """Write the moved source, colored by bones, or by its distance from the target."""
     from torchreg.viz.bone_colors import save_error_ply, save_weight_ply
@@ -423,6 +429,8 @@ WRITERS = (
     Writer("SpineSequence", PICTURES, "lengths, radii and angles of limbs over time", _spine_plot),
     Writer("SpineSequence", MOVIES, "all frames", _spine_movie, ("data",)),
     Writer("SpineSequence", ("",), "a picture of each frame", _spine_pictures, ("data",), files=_frames_of),
+    Writer("SequenceRig", (".glb",), "the skinned mesh with its clip", _rig_motion),
+    Writer("SequenceRig", (".bvh",), "the motion for animation programs", _rig_motion),
     Writer("ScanRegistration", (".ply",), "the moved source, see --color", _scan_ply),
     Writer("ScanRegistration", (".glb",), "the moving, skinned source", _scan_glb),
     Writer("SequenceRegistration", (".urdf",), "the robot, its meshes, and FILE_joints.csv", save_robot,
@@ -435,7 +443,8 @@ WRITERS = (
     Writer("", (".npz",), "all tensors", _any_npz),
 )  # fmt: skip
 _ORIGINS = {
-    "AlignResult": "align", "TrackResult": "track", "SpineSequence": "spine", "ScanRegistration": "register",
+    "AlignResult": "align", "TrackResult": "track", "SpineSequence": "spine", "SequenceRig": "rig",
+    "ScanRegistration": "register",
     "SequenceRegistration": "register --urdf", "Calibration": "calibrate hand",
     "BaseCalibration": "calibrate ROBOT.urdf", "": "any result",
 }  # fmt: skip

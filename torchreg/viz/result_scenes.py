@@ -21,6 +21,7 @@ from torchreg.io.points import PointCloud
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import ScanRegistration, SequenceRegistration
 from torchreg.result import Status
+from torchreg.rigging.results import SequenceRig
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.spines.results import SpineSequence
@@ -58,8 +59,9 @@ def result_scene(result: Any, *, shape: ArticulatedShape | None = None, data: Da
 
     Args:
         result: of any system: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
-            `ScanRegistration`, `SequenceRegistration` or `SpineSequence`; or an `ArticulatedShape`, `TriangleMesh`,
-            `RangeScan`, `PointCloud`, `Skeleton` or tensor (N, 3), or a list of meshes or tensors, one per frame.
+            `ScanRegistration`, `SequenceRegistration`, `SequenceRig` or `SpineSequence`; or an `ArticulatedShape`,
+            `TriangleMesh`, `RangeScan`, `PointCloud`, `Skeleton` or tensor (N, 3), or a list of meshes or tensors, one
+            per frame.
         shape: that was aligned or tracked, by default the one that the result keeps; where there is none, keypoints and
             registered points alone are shown.
         data: measurements, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
@@ -220,6 +222,18 @@ def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Sc
     if result.confidence is not None:
         facts["confidence, worst scan"] = f"{float(result.confidence.min()):.2f}"
     return Scene(title, tuple(layers), up=result.up, facts=facts)
+
+
+@_scene.register
+def _rig_scene(result: SequenceRig, shape: ArticulatedShape | None, data: Data) -> Scene:
+    rig = result.shape
+    clouds = _clouds(data, len(result.poses))
+    scene = posed_scene(
+        rig, result.poses, clouds, near_surface(rig, result.poses), skin=rig.file_skin(), up=result.up,
+        title=f"{counted(len(result.poses), 'frame')}, {counted(len(result.joints), 'bone')}",
+    )  # fmt: skip
+    worst = float(result.errors.nan_to_num(0.0).max())
+    return replace(scene, facts={"status": result.status.value, "distance, worst frame": f"{worst:.2%} of the size"})
 
 
 @_scene.register

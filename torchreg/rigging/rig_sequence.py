@@ -1,0 +1,179 @@
+"""One rig with a clip from a sequence of meshes that share nothing."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_count
+from torchreg._threads import one_thread
+from torchreg.errors import FramesWarning
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.upright import Y_UP, Direction
+from torchreg.registration.register_sequence import register_sequence
+from torchreg.result import Status
+from torchreg.rigging.bones import tree_of_bones
+from torchreg.rigging.config import RigConfig
+from torchreg.rigging.distances import SurfaceSamples, two_way_distance
+from torchreg.rigging.frames import RigFrames, usable_frames
+from torchreg.rigging.poses import SurfaceFitter, poses_of_motions
+from torchreg.rigging.results import SequenceRig
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
+
+# Called with the name of the stage that a step belongs to.
+OnStep = Callable[[str], None]
+
+
+@torch.no_grad()
+@one_thread()
+def rig_sequence(
+    meshes: Sequence[Any],
+    *,
+    template: int | None = None,
+    num_bones: int | None = None,
+    config: RigConfig | None = None,
+    up: Direction | None = None,
+    on_step: OnStep | None = None,
+) -> SequenceRig:
+    """Return one skinned shape and its poses from meshes of one moving thing that share neither vertices nor faces.
+
+    1. Frames of another unit, empty ones and those of another thing's size are left out, with a sentence each.
+    2. The template is the frame of most surface: where limbs touch, surface is lost.
+    3. The template is registered to all frames, from neighbor to neighbor, and bones, weights and joints are found
+       that explain all of them, see `register_sequence`. The strongest joints make a tree.
+    4. The rig of balls at these joints is fitted to every frame's surface by matches both ways, from the registration
+       and from the neighbor in time; the better is kept.
+
+    Args:
+        meshes: T frames, two at least, in one unit and coordinate frame, in the order of time: meshes, scans or clouds
+            as loaders return; the template must have triangles.
+        template: number of the frame whose surface is rigged; by default it is chosen.
+        num_bones: most bones; fewer where the motion needs no more.
+        config: see `RigConfig`.
+        up: (3,) what is upright, kept for files.
+        on_step: called with a word for each stage and frame that is done.
+
+    Returns:
+        a `SequenceRig`.
+
+    Raises:
+        InputError: if fewer than two frames show one thing, none has triangles, or a number is out of range.
+        InputTypeError: if a frame is neither mesh, scan nor cloud.
+
+    Warns:
+        FramesWarning: if frames are left out or not explained by the rig, or nothing bends.
+
+    Differentiable: no.
+
+    Cost: 4 to 6 s a frame on one core, whatever its size.
+
+    References: Le and Deng 2014, Robust and accurate skeletal rigging from mesh sequences, for the problem; Chang and
+    Zwicker 2009, section 6, for bones and weights of all frames at once.
+    """
+    config = RigConfig() if config is None else config
+    count = config.num_bones if num_bones is None else num_bones
+    check_count(count, "num_bones", 1)
+    step = (lambda _: None) if on_step is None else on_step
+    meshes = list(meshes)
+    frames = usable_frames(meshes, template, config.num_points)
+    step("frames")
+    rows = list(range(len(frames.scans)))
+    shape, poses, errors = _rigged(frames, rows, count, config, up, step)
+    good = errors <= config.doubtful
+    if len(rows) // 2 < int(good.sum()) < len(rows):
+        # Another thing in between spoils what follows it; the rig of the others tells which frames those are.
+        shape, poses, errors = _rigged(frames, good.nonzero()[:, 0].tolist(), count, config, up, step)
+    return _result(shape, poses, errors, frames, len(meshes), config, up)
+
+
+def _rigged(
+    frames: RigFrames, rows: list[int], count: int, config: RigConfig, up: Direction | None, step: OnStep
+) -> tuple[ArticulatedShape, Tensor, Tensor]:
+    """Return the rig of some frames, poses (T, D) of all that are used, and their errors (T,)."""
+    found = register_sequence(
+        [frames.scans[row] for row in rows], count, config.cells, config.register,
+        on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
+    )  # fmt: skip
+    bones = tree_of_bones(found, frames.mesh.vertices, config.alike)
+    shape = ArticulatedShape.from_skinned_mesh(
+        frames.mesh.vertices, frames.mesh.faces, bones.weights, bones.joints, bones.parents,
+        joint_names=bones.names, up=Y_UP if up is None else up, dtype=torch.float64,
+    )  # fmt: skip
+    starts = dict(zip(rows, poses_of_motions(shape, bones.names, bones.parents, bones.motions), strict=True))
+    poses, errors = _fitted_poses(shape, starts, frames, config, step)
+    return shape, poses, errors
+
+
+def _fitted_poses(
+    shape: ArticulatedShape, starts: Mapping[int, Tensor], frames: RigFrames, config: RigConfig, step: OnStep
+) -> tuple[Tensor, Tensor]:
+    """Return poses (T, D) of all frames and their errors (T,), from the template outward, from starts of some."""
+    size, skin = float(frames.scans[frames.template].diagonal), shape.file_skin()
+    fitter = SurfaceFitter(_coarse_skin(skin, frames.scans[frames.template]), size, config)
+    poses = shape.rest_pose().repeat(len(frames.scans), 1)
+    errors = poses.new_zeros(len(poses))
+    for direction, end in ((1, len(poses)), (-1, -1)):
+        neighbor = poses[frames.template]
+        for frame in range(frames.template + direction, end, direction):
+            best = fitter.fit(frames.scans[frame], [*([starts[frame]] if frame in starts else []), neighbor])
+            rig = SurfaceSamples.of_mesh(TriangleMesh(skin(best.pose), frames.mesh.faces))
+            poses[frame] = best.pose
+            errors[frame] = two_way_distance(rig, frames.surfaces[frame], frames.scans[frame]) / size
+            if errors[frame] <= config.doubtful:
+                neighbor = poses[frame]
+            step("poses")
+    return poses, errors
+
+
+def _coarse_skin(full: LinearBlendSkin, scan: RangeScan) -> LinearBlendSkin:
+    """Return the skin of a coarse template scan, whose points are vertices of the rig's surface."""
+    index, _ = nearest_neighbor(scan.points, full.points)
+    return LinearBlendSkin(
+        full.shape, full.points[index], full.weights[index], full.reference_pose, normals=scan.normals
+    )
+
+
+def _result(
+    shape: ArticulatedShape, poses: Tensor, errors: Tensor, frames: RigFrames, count: int,
+    config: RigConfig, up: Direction | None,
+) -> SequenceRig:  # fmt: skip
+    """Return the rig with the frames that were left out, and a sentence for each that is not explained."""
+    numbers = list(frames.numbers)
+    doubtful, foreign = errors > config.doubtful, errors > 2 * config.doubtful
+    notes = [
+        f"frame {numbers[row]}: {'left out' if foreign[row] else 'doubtful'}: the rig's surface is "
+        f"{100 * float(errors[row]):.2g} % of its size away: another thing, or limbs that touch"
+        for row in doubtful.nonzero()[:, 0].tolist()
+    ]
+    notes = sorted([*frames.notes, *notes], key=lambda note: int(note.split(":")[0].removeprefix("frame ")))
+    if shape.num_parts == 1:
+        notes.append("nothing bends in these frames: the rig is one bone, which a round thing or a rigid one needs")
+    if notes:
+        warnings.warn("; ".join(notes), FramesWarning, stacklevel=4)
+    all_poses = poses.new_full((count, poses.shape[1]), torch.nan)
+    all_errors, confidence = errors.new_full((count,), torch.nan), errors.new_zeros(count)
+    all_poses[numbers], all_errors[numbers] = poses.masked_fill(foreign[:, None], torch.nan), errors
+    confidence[numbers] = (1 + (errors / config.doubtful) ** 2).reciprocal()
+    status = Status.WITH_WARNINGS if notes else Status.CONVERGED
+    if bool((doubtful & ~foreign).any()) or 2 * int(foreign.sum()) >= len(errors):
+        status = Status.DOUBTFUL
+    skin = shape.file_skin()
+    return SequenceRig(
+        shape=shape,
+        poses=all_poses,
+        weights=skin.weights,
+        joints=shape.part_transforms(shape.rest_pose())[:, :3, 3],
+        errors=all_errors,
+        confidence=confidence,
+        status=status,
+        template=numbers[frames.template],
+        warnings=tuple(notes),
+        up=None if up is None else tuple(float(value) for value in up),  # type: ignore[arg-type]
+    )
