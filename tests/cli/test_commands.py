@@ -27,8 +27,8 @@ finally:
     print(*sorted({"torch", "numpy", "scipy", "matplotlib"} & sys.modules.keys()), file=sys.stderr)
 """
 COMMANDS = typer.main.get_command(app).commands
-NAMES = ("align", "calibrate", "demo", "export", "figure", "formats", "info", "label", "pose", "register", "rig", "spine",
-         "track", "train-initializer", "view")  # fmt: skip
+NAMES = ("align", "calibrate", "demo", "export", "figure", "formats", "info", "label", "pose", "register", "rig",
+         "spine", "track", "train-initializer", "view")  # fmt: skip
 # What may be given twice where there is a source and a target, and how a track names its movie in one word.
 TWICE, WORDS = {"--scale", "--time", "--frame", "--intrinsics", "--data"}, {"--movie"}
 OPTIONS = defaultdict(dict)

@@ -43,10 +43,10 @@ def toy():
     ],
 )
 def test_schedules_are_shares_of_the_size(settings, expected):
-    schedule = alignment.fit.sigma_schedule(ScheduleConfig(start=0.08, **settings), 0.2)
+    schedule = alignment.sigma_schedule(ScheduleConfig(start=0.08, **settings), 0.2)
     assert schedule.values == pytest.approx(expected)
     assert schedule.steps == settings["steps"]
-    assert alignment.fit.sigma_schedule(ScheduleConfig(kind="default"), 0.2) is None
+    assert alignment.sigma_schedule(ScheduleConfig(kind="default"), 0.2) is None
 
 
 @pytest.mark.parametrize("settings", [{"stop": 0.2}, {"stop": 0.0}, {"steps": 0}, {"kappa": 0.0}, {"kappa": 1.5}])
