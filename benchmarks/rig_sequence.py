@@ -28,7 +28,7 @@ from torchreg.geometry.neighbors import NeighborTree, nearest_neighbor
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.scan_clusters import clustered_scan
-from torchreg.rigging.distances import surface_distances
+from torchreg.registration.rigging.distances import surface_distances
 
 NOISE, POINTS, SAMPLES, MOVING, NEAR = 0.001, 8000, 20_000, 0.15, 0.05
 

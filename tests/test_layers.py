@@ -28,7 +28,6 @@ LAYERS = [
     {"datasets", "spines", "registration"},
     {"alignment"},
     {"tracking"},
-    {"rigging"},
     {"storage", "viz"},
     {"cli"},
     {"__init__", "__main__"},

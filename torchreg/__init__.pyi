@@ -56,12 +56,12 @@ from torchreg.registration.register_sequence import register_sequence as registe
 from torchreg.registration.results import PoseSolution as PoseSolution
 from torchreg.registration.results import ScanRegistration as ScanRegistration
 from torchreg.registration.results import SequenceRegistration as SequenceRegistration
+from torchreg.registration.rigging.config import RigConfig as RigConfig
+from torchreg.registration.rigging.results import SequenceRig as SequenceRig
+from torchreg.registration.rigging.rig_sequence import rig_sequence as rig_sequence
 from torchreg.registration.solve_pose import SolvePoseConfig as SolvePoseConfig
 from torchreg.registration.solve_pose import solve_pose as solve_pose
 from torchreg.result import Status as Status
-from torchreg.rigging.config import RigConfig as RigConfig
-from torchreg.rigging.results import SequenceRig as SequenceRig
-from torchreg.rigging.rig_sequence import rig_sequence as rig_sequence
 from torchreg.shapes.articulated import ArticulatedShape as ArticulatedShape
 from torchreg.shapes.hand import Hand as Hand
 from torchreg.shapes.material_points import ShapeOutput as ShapeOutput

@@ -15,7 +15,7 @@ from torchreg.cli.writers import Source, write_optional
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
-    from torchreg.rigging.results import SequenceRig
+    from torchreg.registration.rigging.results import SequenceRig
 
 
 @reporting
@@ -68,7 +68,7 @@ def rig(
         raise InputError(f"--template must be below the number of frames {len(clouds)}, got {template}")
     from tqdm import tqdm
 
-    from torchreg.rigging.rig_sequence import rig_sequence
+    from torchreg.registration.rigging.rig_sequence import rig_sequence
 
     with claimed(glb), tqdm(desc="rig", unit="step", leave=False, disable=quiet) as bar:
         found = rig_sequence(

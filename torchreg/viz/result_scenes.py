@@ -20,8 +20,8 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.points import PointCloud
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import ScanRegistration, SequenceRegistration
+from torchreg.registration.rigging.results import SequenceRig
 from torchreg.result import Status
-from torchreg.rigging.results import SequenceRig
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.spines.results import SpineSequence

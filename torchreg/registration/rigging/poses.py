@@ -11,8 +11,8 @@ from torch import Tensor
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rotation import so3_log
-from torchreg.rigging.config import RigConfig
-from torchreg.rigging.distances import surface_distances
+from torchreg.registration.rigging.config import RigConfig
+from torchreg.registration.rigging.distances import surface_distances
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
 from torchreg.shapes.skin import LinearBlendSkin

@@ -15,7 +15,7 @@ from torchreg.geometry.loaded import as_points, as_scan
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.scan_clusters import clustered_scan
-from torchreg.rigging.distances import SurfaceSamples
+from torchreg.registration.rigging.distances import SurfaceSamples
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.upright import Y_UP, Direction
 from torchreg.registration.register_sequence import register_sequence
+from torchreg.registration.rigging.bones import tree_of_bones
+from torchreg.registration.rigging.config import RigConfig
+from torchreg.registration.rigging.distances import SurfaceSamples, two_way_distance
+from torchreg.registration.rigging.frames import RigFrames, usable_frames
+from torchreg.registration.rigging.poses import SurfaceFitter, poses_of_motions
+from torchreg.registration.rigging.results import SequenceRig
 from torchreg.result import Status
-from torchreg.rigging.bones import tree_of_bones
-from torchreg.rigging.config import RigConfig
-from torchreg.rigging.distances import SurfaceSamples, two_way_distance
-from torchreg.rigging.frames import RigFrames, usable_frames
-from torchreg.rigging.poses import SurfaceFitter, poses_of_motions
-from torchreg.rigging.results import SequenceRig
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
