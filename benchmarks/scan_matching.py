@@ -1,6 +1,7 @@
 """How often the learnt matcher of scans is right, and what an alignment that keeps its matches makes of them.
 
-Pairs of kinds that the matcher never saw in training, and with --data those of its folder ``range_pairs``. By group:
+Pairs of kinds that the matcher never saw in training, and with --data those of its folder ``range_pairs`` and of the
+rigs of its folder ``library``, of eight kinds that are kept from training. By group:
 
 - right: share of visible tokens whose best match lies within 5 % of the diagonal of the truth,
 - hidden: recall and precision of tokens called hidden, of all pairs together, where a probability of one half calls;
@@ -16,6 +17,7 @@ Pairs of kinds that the matcher never saw in training, and with --data those of 
 from __future__ import annotations
 
 import argparse
+import csv
 import itertools
 import sys
 import time
@@ -32,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import torchreg as tr
 from experiments.made_up.creature_kinds import HELD_OUT_KINDS
 from experiments.made_up.matching_pairs import matching_pairs
+from experiments.matcher.rigs import body_of_rig
 from torchreg.registration.blend import blend_linear
 from torchreg.registration.dense.align_scans import align_problem
 from torchreg.registration.dense.config import ScanAlignConfig
@@ -45,6 +48,13 @@ from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 RIGHT, VISIBLE = 0.05, 0.03
 # Logit of what is known for sure.
 SURE = 30.0
+
+
+# Kinds of rigs that are never trained on, and the mean motions of their points, in diagonals.
+RIG_KINDS = frozenset({"horse", "cattle", "shark", "frog", "insect", "hand", "vehicle", "monkey"})
+MOTION = (0.03, 0.15)
+# Pairs of a rig that are drawn until one moves as far as is wanted.
+TRIES = 60
 
 
 @dataclass(frozen=True)
@@ -135,6 +145,23 @@ def held_out(count: int) -> Iterator[Pair]:
             yield Pair(name, found.source, found.target, found.source_truth)
 
 
+def rigs(folder: Path, count: int) -> Iterator[Pair]:
+    """Yield so many pairs of the rigs of kinds that are never trained on, their mean motions spread evenly."""
+    with (folder / "index.csv").open(encoding="utf-8", newline="") as index:
+        rows = [row for row in csv.DictReader(index) if row["kind"] in RIG_KINDS and row["torchreg"] == "ok"]
+    for number, row in enumerate(rows * -(-count // len(rows))):
+        if number == count:
+            return
+        low, high = (MOTION[0] + (MOTION[1] - MOTION[0]) * (number + end) / count for end in (0, 1))
+        body = {row["file"]: body_of_rig(folder / row["file"])}
+        stream = matching_pairs(2000 + number, bodies=body, body_share=1.0)
+        for found in itertools.islice(stream, TRIES):
+            moved = float((found.source_truth - found.source.points).norm(dim=1).mean()) / found.target.diagonal
+            if low <= moved <= high:
+                yield Pair(row["kind"], found.source, found.target, found.source_truth)
+                break
+
+
 def known(folder: Path) -> Iterator[Pair]:
     """Yield the pairs of files."""
     for file in sorted(folder.glob("*.npz")):
@@ -165,6 +192,9 @@ def main(arguments: list[str] | None = None) -> int:
         print("known pairs: skipped; pass the folder that holds range_pairs as --data")
         return 0
     print_rows([(pair.group, measured(pair, matcher)) for pair in known(options.data / "range_pairs")])
+    if (options.data / "library").is_dir():
+        found_rigs = rigs(options.data / "library", 8 if options.smoke else 10 * options.pairs)
+        print_rows([(pair.group, measured(pair, matcher)) for pair in found_rigs])
     return 0
 
 
