@@ -160,6 +160,8 @@ def rigs(folder: Path, count: int) -> Iterator[Pair]:
             if low <= moved <= high:
                 yield Pair(row["kind"], found.source, found.target, found.source_truth)
                 break
+        else:
+            print(f"{row['file']}: left out, as no pair of {TRIES} moves by {low:.1%} to {high:.1%}", flush=True)
 
 
 def known(folder: Path) -> Iterator[Pair]:
