@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,6 @@ from torchreg._checks import as_float_tensor, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.align_stages import (
     AlignBatch,
-    DataOnShape,
     anneal_batch,
     best_start,
     continue_unconverged,
@@ -24,18 +23,18 @@ from torchreg.alignment.align_stages import (
     refit_uncropped,
     search_where_needed,
 )
+from torchreg.alignment.assembly import assembled, unbatched
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.observability import dof_confidence
-from torchreg.alignment.evidence.reliability import CALIBRATION, SurfaceError, judge, without_cut
+from torchreg.alignment.evidence.reliability import without_cut
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
 from torchreg.alignment.fit.annealed_em import OnStep, StageResult
-from torchreg.alignment.fit.problem import AlignProblem, alignment_cost, centered_problem, masked_mean, model_size
+from torchreg.alignment.fit.problem import centered_problem, masked_mean, model_size
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
     check_skin,
     floating_origin,
-    warn_about_degenerate,
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
@@ -43,7 +42,6 @@ from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.search.in_picture import not_found_if_improbable, surest_crop
 from torchreg.alignment.search.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.search.pose_search import mean_distances
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.alignment.shape.person_gradient import person_with_gradients
 from torchreg.alignment.shape.shape_fit import fit_coefficients, fitted_rig
@@ -51,7 +49,7 @@ from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.far_origin import to_local, to_world
-from torchreg.result import Status, normal_copy
+from torchreg.result import normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
@@ -61,8 +59,6 @@ from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
 class _Limits:
     """Limits of an alignment."""
 
-    min_inliers: int = 10  # fewer inliers, and the pose means nothing
-    min_share: float = 0.02  # the same, as a share of the data
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
     num_starts: int = 4  # of a search, of which rivals are told: a box looks alike from as many sides
 
@@ -222,8 +218,8 @@ def _align(
             found = refit_uncropped(batch, uncropped, found, config)
             found = continue_unconverged(batch, uncropped, found, config)
         # Inliers by eq. 2, the posterior by eq. 17.
-        result = _result(batch, found, config, lead, uncropped, seen, rivals=rivals)
-        return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
+        result = assembled(batch, found, config, lead, uncropped, seen, rivals=rivals)
+        return normal_copy(unbatched(result) if clouds.ndim == 2 else result)
 
 
 def _align_person(
@@ -247,7 +243,7 @@ def _align_person(
         skin = _model_skin(person, None, fitted.poses, config)
         batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
-        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem, seen, fitted.error))
+        result = unbatched(assembled(batch, found, config, fitted.lead, batch.problem, seen, fitted.error))
         dofs = shape.num_dofs
         result = normal_copy(replace(
             result,
@@ -345,80 +341,3 @@ def _centered_batch(
         keypoints=seen.keypoints,
     )  # fmt: skip
     return AlignBatch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
-
-
-def _result(
-    batch: AlignBatch,
-    found: StageResult,
-    config: AlignConfig,
-    lead: Tensor | None,
-    uncropped: AlignProblem,
-    seen: Observation,
-    error: SurfaceError | None = None,
-    rivals: Tensor | None = None,
-) -> AlignResult:
-    problem, pose = batch.problem, found.pose
-    rivals = None if rivals is None else _different(batch, pose, rivals)
-    fitted, posed = DataOnShape.of(batch, found, config, problem.data, problem.valid), problem.skin(pose)
-    everything = fitted if seen.everything is None else DataOnShape.of_all(batch, found, config, *seen.everything)
-    cost = alignment_cost(problem, pose, torch.where(problem.valid, fitted.distances, 0.0))
-    inliers = fitted.inliers
-    world = shifted(pose, batch.origin)
-    # What lies off the surface tells nothing of the pose, unless all does.
-    told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
-    degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    judgement = judge(uncropped, pose, lead, error, seen.frames, rivals)
-    confidence = torch.where(degenerate, 0.0, judgement.confidence)
-    converged = found.change <= config.pose_atol
-    converged = converged | judgement.converged if config.surface_steps or error is not None else converged
-    rows = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
-    return AlignResult(
-        pose=world,
-        registered=posed + batch.origin.unsqueeze(1),
-        keypoints=problem.skin.shape.keypoints(world),
-        distances=everything.distances,
-        inliers=everything.inliers,
-        posterior=everything.posterior,
-        sigma=found.sigma,
-        cost=cost,
-        status=tuple(_status(*row) for row in zip(*(row.tolist() for row in rows), strict=True)),
-        history=tuple(batch.history),
-        covariance=judgement.covariance,
-        dof_confidence=judgement.dof_confidence,
-        confidence=confidence,
-        evidence=judgement.evidence.table(),
-        doubt=judgement.doubt,
-        rivals=rivals,
-    )
-
-
-def _different(batch: AlignBatch, pose: Tensor, rivals: Tensor) -> Tensor:
-    """Return rivals (B, R, num_dofs), NaN where they are as right as the poses (B, num_dofs) found."""
-    local = torch.cat([pose.unsqueeze(1), shifted(rivals, -batch.origin.unsqueeze(1))], dim=1)
-    apart = mean_distances(batch.problem, local)[:, 0, 1:] > CALIBRATION.right * batch.problem.size
-    return torch.where(apart.unsqueeze(-1), rivals, torch.nan)
-
-
-def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, confidence: float) -> Status:
-    if num_data == 0:
-        return Status.NO_DATA
-    if degenerate:
-        return Status.DEGENERATE
-    if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
-        return Status.FEW_INLIERS
-    if confidence < CALIBRATION.doubtful:
-        return Status.DOUBTFUL
-    return Status.CONVERGED if converged else Status.MAX_STEPS
-
-
-def _unbatched(result: AlignResult) -> AlignResult:
-    """Return the result of the single problem of a batch."""
-    first = {
-        item.name: getattr(result, item.name)[0]
-        for item in fields(result)
-        if item.name not in ("history", "origin", "shape") and getattr(result, item.name) is not None
-    }
-    rivals = first.get("rivals")
-    if rivals is not None:
-        first["rivals"] = rivals[rivals.isfinite().all(-1)]
-    return replace(result, **first)
