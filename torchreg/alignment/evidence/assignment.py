@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from torch import Tensor
@@ -10,7 +11,13 @@ from torch import Tensor
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.neighbors import k_nearest_others, sampling_distance
 
-ELSEWHERE, TOUCHING, ON_SHAPE = 0, 1, 2
+
+class Assignment(IntEnum):
+    """What a datum belongs to."""
+
+    ELSEWHERE = 0
+    TOUCHING = 1
+    SHAPE = 2
 
 
 @dataclass(frozen=True)
@@ -25,12 +32,12 @@ _GRAPH = _Graph()
 
 
 def assigned(points: Tensor, on_shape: Tensor) -> Tensor:
-    """Return for points (M, 3) whether they are `ON_SHAPE`, on a surface `TOUCHING` it, or `ELSEWHERE`, (M,) int64.
+    """Return for points (M, 3) their `Assignment` (M,), int64: to the shape, to a surface touching it, or elsewhere.
 
     ``on_shape``: (M,) bool. Two data are neighbors if one is among the eight nearest of the other, within three times
     the typical distance; a surface is what neighbors connect off the shape.
     """
-    found = torch.where(on_shape, ON_SHAPE, ELSEWHERE)
+    found = torch.where(on_shape, int(Assignment.SHAPE), int(Assignment.ELSEWHERE))
     known = points.isfinite().all(-1).nonzero()[:, 0]
     if len(known) < 2:
         return found
@@ -41,5 +48,5 @@ def assigned(points: Tensor, on_shape: Tensor) -> Tensor:
     surface = connected_components(edges[~others[edges].any(-1)], len(near)).to(near.device)
     across = edges[others[edges].sum(-1) == 1].flatten()
     touching = torch.isin(surface, surface[across[~others[across]]]) & ~others
-    found[known[touching]] = TOUCHING
+    found[known[touching]] = int(Assignment.TOUCHING)
     return found

@@ -54,8 +54,8 @@ class SurfaceSamples:
 def two_way_distance(rig: SurfaceSamples, seen: SurfaceSamples, scan: RangeScan) -> float:
     """Return the mean distance of two surfaces, both ways alike; a rig beyond a scan's border counts one way alone."""
     border = scan.boundary[nearest_neighbor(rig.points, scan.points)[0]]
-    there, here = seen.distances(rig.points[~border]), rig.distances(seen.points)
-    parts = [part.mean() for part in (there, here) if len(part)]
+    forward, backward = seen.distances(rig.points[~border]), rig.distances(seen.points)
+    parts = [part.mean() for part in (forward, backward) if len(part)]
     return float(torch.stack(parts).mean())
 
 

@@ -85,15 +85,15 @@ class SurfaceFitter:
         """Return the mean two-way distance of the surfaces, in diagonals."""
         points, normals = self.skin(pose), self.skin.posed_normals(pose)
         index, back = target.match(points, normals)
-        there = surface_distances(points - target.points[index], target.normals[index], target.spacing)
-        there = there[target.inside[index]]
-        here = surface_distances(target.points - points[back], normals[back], target.spacing)
+        forward = surface_distances(points - target.points[index], target.normals[index], target.spacing)
+        forward = forward[target.inside[index]]
+        backward = surface_distances(target.points - points[back], normals[back], target.spacing)
         # A scan of nothing but borders shows how far it is from the rig, not the rig from it.
-        parts = [part.mean() for part in (there, here) if len(part)]
+        parts = [part.mean() for part in (forward, backward) if len(part)]
         return float(sum(parts)) / len(parts) / self.size
 
     def _linearized(self, target: _Target, pose: Tensor, neighbor: Tensor, width: float) -> Linearization:
-        """Return matches both ways at a pose (D,) as one least-squares problem, and the pull of the neighbor."""
+        """Return matches both ways at a pose (D,) as one least-squares problem, with a prior about the neighbor."""
         points, jacobian = self.skin.jacobian(pose, chart="tangent")
         normals = self.skin.posed_normals(pose)
         index, back = target.match(points, normals)
@@ -111,14 +111,14 @@ class SurfaceFitter:
         metric = weight[:, None, None] * (
             direction[:, :, None] * direction[:, None, :] + along * torch.eye(3, dtype=points.dtype)
         )
-        pull = (metric @ residual[:, :, None])[..., 0]
+        weighted = (metric @ residual[:, :, None])[..., 0]
         count = len(points)
         metrics = metric.new_zeros(count, 3, 3).index_add(0, model, metric)
-        pulls = pull.new_zeros(count, 3).index_add(0, model, pull)
+        forces = weighted.new_zeros(count, 3).index_add(0, model, weighted)
         scaled = jacobian / self.size
         flat = scaled.reshape(-1, scaled.shape[-1])
         hessian = flat.mT @ (metrics @ scaled).reshape(flat.shape)
-        gradient = flat.mT @ pulls.reshape(-1)
+        gradient = flat.mT @ forces.reshape(-1)
         joints = torch.zeros_like(pose)
         joints[BASE_DOFS:] = self.config.stay**2
         gradient = gradient + joints * difference(neighbor, pose)

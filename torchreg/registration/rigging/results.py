@@ -31,7 +31,7 @@ class SequenceRig(Result):
         weights: (V, B) of the template's vertices, rows sum to one, four at most are not zero.
         joints: (B, 3) of the bones at rest; that of the root is the middle of what it moves.
         errors: (T,) mean two-way distance of the posed surface from the frame's, share of the template's diagonal.
-        confidence: (T,) from 0 to 1, that the frame's pose is right.
+        confidence: (T,) from 0 to 1, falls with the error: one half where a frame is doubtful. It is not calibrated.
         status: DOUBTFUL if frames are not explained; WITH_WARNINGS if frames were left out, or nothing bends.
         template: number of the frame that is the rig's surface.
         warnings: one sentence for each frame that is left out or not explained, and one if nothing bends.

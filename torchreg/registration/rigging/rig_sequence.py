@@ -72,7 +72,7 @@ def rig_sequence(
 
     Differentiable: no.
 
-    Cost: 4 to 6 s a frame on one core, whatever its size.
+    Cost: 2 to 5 s a frame on one core, whatever its size.
 
     References: Le and Deng 2014, Robust and accurate skeletal rigging from mesh sequences, for the problem; Chang and
     Zwicker 2009, section 6, for bones and weights of all frames at once.
