@@ -208,7 +208,7 @@ class Status(Enum):
     NO_DATA = "no_data"
     LOST = "lost"
     OTHER_UNITS = "other_units"
-    NOT_FOUND = "not_found"  # what was looked for is nowhere in a picture
+    NOT_FOUND = "not_found"  # in a picture: it is not there, or the search missed it
     DOUBTFUL = "doubtful"  # a result that its own evidence speaks against
     DEGENERATE = "degenerate"  # data at one place, on a line or on a plane, which determine no pose
 

@@ -109,10 +109,10 @@ def test_what_a_crop_cuts_off_is_told_from_what_stands_alone():
     assert torch.equal(cut, strip & (frame.pixels[:, 0] > 60))
 
 
-def test_a_picture_of_planes_alone_does_not_show_the_shape(links, links_skin):
+def test_in_a_picture_of_planes_alone_the_shape_is_not_found(links, links_skin):
     across = torch.arange(96, dtype=torch.float64)
     corner = tr.DepthFrame((2.0 - 0.005 * (across - 50).abs()).expand(72, -1).clone(), CAMERA)
     found = tr.align(links, corner, model_points=links_skin)
     assert found.status is tr.Status.NOT_FOUND
     assert not found.status.usable
-    assert found.doubt.startswith("the picture does not show the shape, with probability")
+    assert found.doubt.startswith("not found in the picture: the best pose is wrong with a probability of")

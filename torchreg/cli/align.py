@@ -109,8 +109,8 @@ def align(
     What is known of the pose, --joints, counts with its --joint-std against data of which neighbors err together.
     So do keypoints that a detector found, --keypoints, of which some may be wrong.
 
-    Exit codes: 0; 1 if an alignment is doubtful, found too few inliers to mean anything, or a whole picture does not
-    show the shape, or an output other than the results could not be written; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if an alignment is doubtful, found too few inliers to mean anything, or did not find the shape in a
+    whole picture, or an output other than the results could not be written; 2 for an error; 130 for Ctrl-C.
     """
     views.check()
     check_used(fit_shape, "--fit-shape", {"--rig": rig})

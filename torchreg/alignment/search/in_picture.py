@@ -19,7 +19,7 @@ class Choice:
 
     sure: float = 0.8  # confidence from which on no other crop is tried
     enough: float = CALIBRATION.doubtful  # from which on no surface farther away is
-    absent: float = 0.05  # below which the picture does not show the shape, at the usual level of a test
+    not_found: float = 0.05  # below which the best pose is rejected, at the usual level of a test
 
 
 CHOICE = Choice()
@@ -51,12 +51,12 @@ def surest_crop(
 
 
 def not_found_if_improbable(found: AlignResult) -> AlignResult:
-    """Return the result of a whole picture, NOT_FOUND where it hardly shows the shape in the most probable pose."""
+    """Return the result of a whole picture, NOT_FOUND where even the most probable pose is hardly right."""
     confidence = _confidence(found)
-    if found.statuses[0].usable or confidence >= CHOICE.absent:
+    if found.statuses[0].usable or confidence >= CHOICE.not_found:
         return found
-    absent = f"the picture does not show the shape, with probability {1 - confidence:.0%}"
-    doubts = [absent, found.doubt] if isinstance(found.doubt, str) and found.doubt else [absent]
+    reason = f"not found in the picture: the best pose is wrong with a probability of {1 - confidence:.1%}"
+    doubts = [reason, found.doubt] if isinstance(found.doubt, str) and found.doubt else [reason]
     return replace(found, status=Status.NOT_FOUND, doubt="; ".join(doubts))
 
 
