@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from tests.geometry.draws import D, rand, seeded, sheet_faces
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
@@ -18,29 +19,14 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.scan_clusters import clustered_scan
 from torchreg.geometry.visibility import aim, rasterize
 
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
+ELLIPSOID = torch.tensor([1.0, 0.6, 0.8])
 
 
-def sheet(height=12, width=15, dtype=torch.float64):
+def sheet(height=12, width=15):
     """A bent grid of points, and its triangles, counter-clockwise from above."""
-    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    x, y = column.reshape(-1).to(dtype), row.reshape(-1).to(dtype)
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     points = torch.stack((x, y, -0.02 * ((x - 7) ** 2 + (y - 5) ** 2)), dim=-1)
-    a = (row * width + column)[:-1, :-1].reshape(-1)
-    b, c, d = a + 1, a + width, a + width + 1
-    return points, torch.cat((torch.stack((a, b, d), -1), torch.stack((a, d, c), -1)))
-
-
-def rim(height=12, width=15):
-    mask = torch.zeros(height, width, dtype=torch.bool)
-    mask[0], mask[-1], mask[:, 0], mask[:, -1] = True, True, True, True
-    return mask.reshape(-1)
-
-
-def as_trimesh(points, faces):
-    return trimesh.Trimesh(points.numpy(), faces.numpy(), process=False)
+    return points.reshape(-1, 3), sheet_faces(height, width)
 
 
 def check_same(scan, other, tolerance=1e-9):
@@ -53,9 +39,8 @@ def check_same(scan, other, tolerance=1e-9):
 
 def test_normals_and_boundary_of_faces_are_those_of_trimesh():
     points, faces = sheet()
-    keep = torch.rand(len(faces), generator=seeded()) > 0.1
-    mesh = as_trimesh(points, faces[keep])
-    scan = RangeScan(points, faces[keep])
+    faces = faces[torch.rand(len(faces), generator=seeded()) > 0.1]
+    scan, mesh = RangeScan(points, faces), trimesh.Trimesh(points.numpy(), faces.numpy(), process=False)
     used = np.unique(mesh.faces)
     np.testing.assert_allclose(scan.normals[used], mesh.vertex_normals[used], atol=1e-6)
     single = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
@@ -64,24 +49,27 @@ def test_normals_and_boundary_of_faces_are_those_of_trimesh():
     np.testing.assert_allclose(scan.diagonal, np.linalg.norm(np.ptp(points.numpy(), axis=0)))
     near = cKDTree(points.numpy()).query(points.numpy(), 2)[0][:, 1]
     assert scan.spacing == pytest.approx(np.median(near))
-    assert scan.faces.dtype == torch.int64
 
 
-def test_points_alone_find_nearly_what_faces_say():
+def test_points_alone_give_nearly_what_faces_give_and_a_viewpoint_turns_both():
     points, faces = sheet()
     scan, bare = RangeScan(points, faces), RangeScan(points)
-    assert torch.equal(scan.boundary, rim())
-    assert torch.equal(bare.boundary, rim())
+    rim = (points[:, 0] % 14 == 0) | (points[:, 1] % 11 == 0)
+    assert torch.equal(scan.boundary, rim)
+    assert torch.equal(bare.boundary, rim)
     assert float((scan.normals * bare.normals).sum(-1).min()) > 0.97
-    assert bare.faces is None
-    assert bare.spacing == scan.spacing
+    assert (bare.faces, bare.viewpoint, bare.spacing) == (None, None, scan.spacing)
+    below = torch.tensor([7.0, 5.0, -50.0])
+    for shape in (faces, None):
+        turned = RangeScan(points, shape, viewpoint=below)
+        torch.testing.assert_close(turned.normals, -RangeScan(points, shape).normals)
+        assert torch.equal(turned.viewpoint, below.double())
 
 
 def test_a_hole_and_its_rim_without_faces():
     points = torch.rand(4000, 3, generator=seeded()) * torch.tensor([2.0, 2.0, 0.0])
     radius = (points[:, :2] - 1).norm(dim=-1)
-    scan = RangeScan(points[radius > 0.3])
-    from_hole = radius[radius > 0.3] - 0.3
+    scan, from_hole = RangeScan(points[radius > 0.3]), radius[radius > 0.3] - 0.3
     middle = (scan.points[:, :2] - 1).abs().amax(dim=-1) < 0.85
     assert float(scan.boundary[(from_hole < 0.3 * scan.spacing)].double().mean()) > 0.6
     assert float(scan.boundary[(from_hole > 4 * scan.spacing) & middle].double().mean()) < 0.01
@@ -117,17 +105,6 @@ def test_zero_normals_and_points_without_faces_are_estimated():
     torch.testing.assert_close(none.normals, RangeScan(points).normals, atol=1e-3, rtol=0)
 
 
-def test_a_viewpoint_turns_what_winding_and_bulge_say():
-    points, faces = sheet()
-    below = torch.tensor([7.0, 5.0, -50.0])
-    for shape in (faces, None):
-        scan = RangeScan(points, shape, viewpoint=below)
-        assert float(scan.normals[:, 2].max()) < -0.5
-        assert scan.viewpoint.dtype == torch.float64
-        assert scan.viewpoint.tolist() == below.tolist()
-    assert RangeScan(points).viewpoint is None
-
-
 def test_triangles_that_share_places_but_no_indices_are_one_surface():
     points, faces = sheet()
     scan = RangeScan(points, faces)
@@ -139,24 +116,22 @@ def test_triangles_that_share_places_but_no_indices_are_one_surface():
 
 def test_degenerate_doubled_and_turned_faces_change_nothing():
     points, faces = sheet()
-    scan = RangeScan(points, faces)
+    scan, bare = RangeScan(points, faces), RangeScan(points)
     bad = torch.cat((faces, faces[:9], faces[20:24].flip(-1), torch.tensor([[4, 4, 9], [7, 7, 7]])))
     check_same(RangeScan(points, bad), scan)
     turned = faces.clone()
     turned[::5] = turned[::5].flip(-1)
-    check_same(RangeScan(points, turned), scan)
-
-
-def test_faces_of_no_use_count_as_none():
-    points, _ = sheet()
-    bare = RangeScan(points)
-    for faces in (torch.zeros(0, 3), [], None):
-        scan = RangeScan(points, torch.as_tensor(faces).long().reshape(0, 3) if faces is not None else None)
-        assert scan.faces is None
-        check_same(scan, bare)
+    check_same(RangeScan(points.float(), turned.int()).to(D), scan, 1e-6)
+    assert RangeScan(points, faces[:0]).faces is None
+    check_same(RangeScan(points, faces[:0]), bare)
     flat = RangeScan(points, torch.tensor([[0, 0, 1]]))
     torch.testing.assert_close(flat.normals, bare.normals, atol=1e-3, rtol=0)
-    assert bool(flat.boundary.all())
+    for scan in (flat, RangeScan(torch.eye(3)), RangeScan(torch.eye(3), torch.tensor([[0, 1, 2]]))):
+        assert bool(scan.boundary.all())
+    torch.testing.assert_close(scan.normals, torch.full((3, 3), 3**-0.5))
+    line = RangeScan(torch.arange(30.0).reshape(10, 3))
+    assert bool(line.boundary.all())
+    torch.testing.assert_close(line.normals.norm(dim=-1), torch.ones(10))
 
 
 @settings(max_examples=10, deadline=None)
@@ -166,91 +141,63 @@ def test_faces_of_no_use_count_as_none():
     with_faces=st.booleans(),
     seed=st.integers(0, 99),
 )
-def test_a_moved_scan_is_the_scan_of_moved_points(turn, scale, with_faces, seed):
+def test_a_moved_scan_is_the_scan_of_moved_points_in_any_order(turn, scale, with_faces, seed):
     points, faces = sheet()
-    shake = 0.1 * torch.rand(points.shape, generator=seeded(seed), dtype=torch.float64)
-    scan = RangeScan(points + shake, faces if with_faces else None, viewpoint=torch.tensor([0.0, 0, 90]))
-    rotation = so3_exp(torch.tensor(turn, dtype=torch.float64))
-    motion = rigid_matrix(scale * rotation, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
+    shaken, order = points + 0.1 * rand(*points.shape, seed=seed), torch.randperm(len(points), generator=seeded(seed))
+    scan = RangeScan(shaken, faces if with_faces else None, viewpoint=torch.tensor([0.0, 0, 90]))
+    rotation = so3_exp(torch.tensor(turn, dtype=D))
+    motion = rigid_matrix(scale * rotation, torch.tensor([1.0, -2.0, 3.0], dtype=D))
     moved = scan.transformed(motion)
-    eye = scale * (rotation @ scan.viewpoint) + motion[:3, 3]
-    torch.testing.assert_close(moved.viewpoint, eye)
-    check_same(moved, RangeScan(moved.points, moved.faces, viewpoint=eye), 1e-9 * scale)
+    torch.testing.assert_close(moved.viewpoint, scale * (rotation @ scan.viewpoint) + motion[:3, 3])
     torch.testing.assert_close(moved.points, scale * scan.points @ rotation.mT + motion[:3, 3])
-
-
-def test_order_does_not_matter():
-    points, faces = sheet()
-    # Of neighbors exactly as far as each other any may be found.
-    points = points + 0.01 * torch.rand(points.shape, generator=seeded(1), dtype=torch.float64)
-    order = torch.randperm(len(points), generator=seeded())
-    for shape in (faces, None):
-        scan = RangeScan(points, shape)
-        shuffled = RangeScan(points[order], None if shape is None else order.argsort()[shape])
-        torch.testing.assert_close(shuffled.normals, scan.normals[order])
-        assert torch.equal(shuffled.boundary, scan.boundary[order])
+    direct = RangeScan(moved.points[order], order.argsort()[faces] if with_faces else None, viewpoint=moved.viewpoint)
+    torch.testing.assert_close(direct.normals, moved.normals[order], atol=1e-6, rtol=0)
+    assert torch.equal(direct.boundary, moved.boundary[order])
+    assert (direct.spacing, direct.diagonal) == pytest.approx((moved.spacing, moved.diagonal), rel=1e-6)
 
 
 def test_subsample_by_count_or_spacing():
     scan = RangeScan(*sheet())
-    few = scan.uniform_subsample(40)
+    few, wide = scan.uniform_subsample(40), scan.uniform_subsample(spacing=3.0)
     assert len(few.unique()) == 40
-    apart = torch.cdist(scan.points[few], scan.points[few]).fill_diagonal_(torch.inf)
-    assert float(apart.min()) > 1.4
-    wide = scan.uniform_subsample(spacing=3.0)
-    assert float(torch.cdist(scan.points[wide], scan.points[wide]).fill_diagonal_(torch.inf).min()) > 3.0
+    for index, least in ((few, 1.4), (wide, 3.0)):
+        assert float(torch.cdist(scan.points[index], scan.points[index]).fill_diagonal_(torch.inf).min()) > least
     assert torch.equal(scan.uniform_subsample(10**6), torch.arange(180))
     other = scan.uniform_subsample(40, generator=seeded(3))
     assert not torch.equal(other, few)
     assert torch.equal(other, scan.uniform_subsample(40, generator=seeded(3)))
+    # What is returned again cannot be spoilt.
+    expected = few.clone()
+    few.zero_()
+    assert torch.equal(scan.uniform_subsample(40), expected)
 
 
 def test_subset_keeps_normals_and_the_faces_among_the_points():
     points, faces = sheet()
-    scan = RangeScan(points, faces, viewpoint=torch.tensor([0.0, 0, 9]))
-    left = points[:, 0] < 6.5
-    part = scan.subset(left)
+    scan, left = RangeScan(points, faces, viewpoint=torch.tensor([0.0, 0, 9])), points[:, 0] < 6.5
+    part, cut = scan.subset(left), scan.subset(left, mark_cut=True)
     check_same(scan.subset(left.nonzero()[:, 0]), part)
     torch.testing.assert_close(part.normals, scan.normals[left])
     assert torch.equal(part.boundary, scan.boundary[left])
     assert torch.equal(part.viewpoint, scan.viewpoint)
     assert part.diagonal == pytest.approx(RangeScan(points[left]).diagonal)
-    inside = left[faces].all(dim=-1)
-    assert torch.equal(part.points[part.faces], points[faces[inside]])
-    check_same(
-        RangeScan(points, faces).subset(torch.ones(180, dtype=torch.bool), mark_cut=True), RangeScan(points, faces)
-    )
-    cut = scan.subset(left, mark_cut=True)
+    assert torch.equal(part.points[part.faces], points[faces[left[faces].all(dim=-1)]])
+    check_same(scan.subset(torch.ones(180, dtype=torch.bool), mark_cut=True), scan)
     assert torch.equal(cut.boundary, RangeScan(cut.points, cut.faces).boundary)
-    bare = RangeScan(points).subset(left, mark_cut=True)
-    assert torch.equal(bare.boundary, cut.boundary)
+    assert torch.equal(RangeScan(points).subset(left, mark_cut=True).boundary, cut.boundary)
     few = scan.subset(scan.uniform_subsample(20))
     assert few.faces is None
     assert few.spacing > 1.5 * scan.spacing
 
 
-def test_dtypes():
-    points, faces = sheet()
-    scan = RangeScan(points, faces, viewpoint=torch.tensor([0.0, 0, 9]))
-    single = scan.to(torch.float32)
-    assert {single.points.dtype, single.normals.dtype, single.viewpoint.dtype} == {torch.float32}
-    assert single.boundary.dtype == torch.bool
-    check_same(single.to(torch.float64), scan, 1e-5)
-    check_same(RangeScan(points.float(), faces.int()), single, 1e-6)
-    assert RangeScan(points.numpy(), faces.numpy()).points.dtype == torch.float64
-    assert RangeScan(points.tolist()).points.dtype == torch.get_default_dtype()
-
-
 def rendered(camera):
-    """The depth image of an ellipsoid before a wall, its camera, and the surface."""
-    sphere = unit_sphere(4, dtype=torch.float64)
-    mesh = TriangleMesh(sphere.vertices * torch.tensor([1.0, 0.6, 0.8]), sphere.faces)
+    """The depth image of an ellipsoid in front of a wall, its intrinsics and its camera's pose."""
+    sphere = unit_sphere(4, dtype=D)
+    mesh = TriangleMesh(sphere.vertices * ELLIPSOID, sphere.faces)
     view = aim(mesh.vertices, torch.tensor(camera), size=160)
     depth = rasterize(mesh, view).depth
-    focal = 1 / view.pitch
-    center = -view.corner / view.pitch - 0.5
-    world = rigid_matrix(view.rotation.mT, view.position)
-    return torch.where(depth.isfinite(), depth, 12.0), (focal, focal, float(center[0]), float(center[1])), world
+    focal, center = 1 / view.pitch, (-view.corner / view.pitch - 0.5).tolist()
+    return depth.nan_to_num(posinf=12.0), (focal, focal, *center), rigid_matrix(view.rotation.mT, view.position)
 
 
 @pytest.mark.parametrize("camera", [(0.0, 0.0, -6.0), (4.0, -3.0, 2.0)])
@@ -258,39 +205,22 @@ def test_a_rendered_depth_image_gives_the_surface_back(camera):
     depth, intrinsics, world = rendered(camera)
     scan = RangeScan.from_depth(depth, intrinsics, world)
     torch.testing.assert_close(scan.viewpoint, world[:3, 3])
-    local = (scan.points - world[:3, 3]) @ world[:3, :3]
-    body = local[:, 2] < 11
+    body = ((scan.points - world[:3, 3]) @ world[:3, :3])[:, 2] < 11
     # On the ellipsoid, but for its facets.
-    level = (scan.points / torch.tensor([1.0, 0.6, 0.8])).norm(dim=-1)
-    assert float((level[body] - 1).abs().max()) < 0.01
+    assert float(((scan.points / ELLIPSOID).norm(dim=-1)[body] - 1).abs().max()) < 0.01
     assert bool((body[scan.faces].all(-1) | ~body[scan.faces].any(-1)).all())
     assert float(body.double().mean()) > 0.5
-    toward = torch.nn.functional.normalize(world[:3, 3] - scan.points, dim=-1)
-    assert float((scan.normals * toward).sum(-1).min()) > 0
-    right = torch.nn.functional.normalize(scan.points / torch.tensor([1.0, 0.6, 0.8]) ** 2, dim=-1)
-    inner = body & ~scan.boundary
-    assert float((scan.normals * right).sum(-1)[inner].min()) > 0.9
-    assert bool(scan.boundary[body].any())
-    assert float(scan.boundary[body].double().mean()) < 0.06
+    assert float((scan.normals * (world[:3, 3] - scan.points)).sum(-1).min()) > 0
+    right = torch.nn.functional.normalize(scan.points / ELLIPSOID**2, dim=-1)
+    assert float((scan.normals * right).sum(-1)[body & ~scan.boundary].min()) > 0.9
+    assert 0 < float(scan.boundary[body].double().mean()) < 0.06
 
 
 def test_depth_without_a_pose_and_in_integers():
     scan = RangeScan.from_depth(np.full((6, 8), 1000, dtype=np.int32), (500.0, 500.0, 3.5, 2.5))
-    assert len(scan) == 48
-    assert scan.spacing == pytest.approx(2.0)
+    assert (len(scan), scan.spacing, int(scan.boundary.sum())) == (48, pytest.approx(2.0), 24)
     torch.testing.assert_close(scan.normals, torch.tensor([[0.0, 0, -1]]).expand(48, 3))
     assert scan.viewpoint.tolist() == [0, 0, 0]
-    assert int(scan.boundary.sum()) == 24
-
-
-def test_the_smallest_scans():
-    triangle = RangeScan(torch.eye(3), torch.tensor([[0, 1, 2]]))
-    torch.testing.assert_close(triangle.normals, torch.full((3, 3), 3**-0.5))
-    assert bool(triangle.boundary.all())
-    assert bool(RangeScan(torch.eye(3)).boundary.all())
-    line = RangeScan(torch.arange(30.0).reshape(10, 3))
-    assert bool(line.boundary.all())
-    torch.testing.assert_close(line.normals.norm(dim=-1), torch.ones(10))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -304,31 +234,19 @@ def test_on_a_graphics_card():
     assert RangeScan.from_depth(torch.ones(5, 5).cuda(), (5.0, 5.0, 2.0, 2.0)).boundary.is_cuda
 
 
-def test_even_samples_that_were_asked_for_before_are_the_same_and_cannot_be_spoilt():
-    scan = RangeScan(torch.rand(300, 3, generator=torch.Generator().manual_seed(3)))
-    first = scan.uniform_subsample(50)
-    expected = first.clone()
-    first.zero_()
-    assert torch.equal(scan.uniform_subsample(50), expected)
-    assert torch.equal(expected, RangeScan(scan.points).uniform_subsample(50))
-
-
 @pytest.mark.parametrize("first", [0, 3])
-def test_the_first_point_beside_a_cut_is_on_the_boundary_too(first):
+def test_the_first_point_at_a_cut_is_on_the_boundary_too(first):
     """Of a fan around point 0, one triangle is cut away: both of its points that are left end at the cut."""
     turns = torch.arange(6) * math.pi / 3
     ring = torch.stack([turns.cos(), turns.sin(), 0.1 * turns.sin()], dim=-1)
-    points = torch.cat([torch.zeros(1, 3), ring])
     order = torch.arange(7).roll(-first)
-    place = order.argsort()
-    faces = place[torch.tensor([[0, 1 + k, 1 + (k + 1) % 6] for k in range(6)])]
-    scan = RangeScan(points[order], faces).replaced(boundary=torch.zeros(7, dtype=torch.bool))
+    index = order.argsort()
+    faces = index[torch.tensor([[0, 1 + k, 1 + (k + 1) % 6] for k in range(6)])]
+    scan = RangeScan(torch.cat([torch.zeros(1, 3), ring])[order], faces)
     left = torch.ones(7, dtype=torch.bool)
-    left[place[4]] = False
-    cut = scan.subset(left, mark_cut=True)
-    kept = order[left]
-    assert {int(number) for number in kept[cut.boundary]} >= {0, 3, 5}
-    assert not bool(cut.boundary[(kept == 1).nonzero()[0, 0]])
+    left[index[4]] = False
+    cut = scan.replaced(boundary=torch.zeros(7, dtype=torch.bool)).subset(left, mark_cut=True)
+    assert {0, 3, 5} <= set(order[left][cut.boundary].tolist()) <= {0, 2, 3, 4, 5, 6}
 
 
 @pytest.mark.parametrize("with_faces", [True, False])

@@ -10,13 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.graphs import (
-    Graph,
-    component_links,
-    connected_components,
-    minimum_spanning_forest,
-    rooted,
-)
+from torchreg.geometry.graphs import Graph, component_links, connected_components, minimum_spanning_forest, rooted
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 
 

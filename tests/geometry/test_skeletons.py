@@ -1,5 +1,4 @@
 import math
-from itertools import pairwise
 
 import networkx
 import pytest
@@ -7,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.geometry.draws import D, randn
 from torchreg.geometry.rigid import rigid_matrix, se3_exp
 from torchreg.geometry.skeleton import Skeleton, build_skeleton, nearest_rotation, resample_curve
 
@@ -14,21 +14,9 @@ from torchreg.geometry.skeleton import Skeleton, build_skeleton, nearest_rotatio
 EDGES = [(0, 1), (1, 2), (2, 3), (2, 4), (4, 5), (5, 6), (4, 7)]
 
 
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def figure(edges=EDGES, **more):
+def figure(edges=EDGES):
     count = 1 + max(max(edge) for edge in edges)
-    return Skeleton(random(count, 3), edges, torch.ones(count), **more)
-
-
-def star(arms, length):
-    hub, edges = 0, []
-    for arm in range(arms):
-        chain = [hub, *range(1 + arm * length, 1 + (arm + 1) * length)]
-        edges += list(pairwise(chain))
-    return figure(edges)
+    return Skeleton(randn(count, 3), edges, torch.ones(count))
 
 
 def contracted(edges):
@@ -39,7 +27,7 @@ def contracted(edges):
     return graph
 
 
-def test_tips_junctions_and_limbs_of_a_tree_drawn_by_hand():
+def test_tips_junctions_limbs_and_paths_of_a_tree_drawn_by_hand():
     tree = figure()
     assert len(tree) == 8
     assert tree.tips.tolist() == [0, 3, 6, 7]
@@ -47,19 +35,17 @@ def test_tips_junctions_and_limbs_of_a_tree_drawn_by_hand():
     assert tree.degrees[tree.junctions].tolist() == [3, 3]
     assert [limb.tolist() for limb in tree.limbs] == [[0, 1, 2], [3, 2], [6, 5, 4], [7, 4], [2, 4]]
     assert tree.limb_ends.tolist() == [[0, 2], [3, 2], [6, 4], [7, 4], [2, 4]]
-    assert repr(tree) == "Skeleton(8 nodes, 4 tips, 5 limbs, junctions of degree [3, 3])"
     expected = [sum(math.dist(tree.nodes[a], tree.nodes[b]) for a, b in pair) for pair in [[(0, 1), (1, 2)], [(2, 3)]]]
     assert tree.limb_lengths[:2].tolist() == pytest.approx(expected)
     assert float(tree.length) == pytest.approx(sum(math.dist(tree.nodes[a], tree.nodes[b]) for a, b in EDGES))
+    assert tree.path(0, 6).tolist() == [0, 1, 2, 4, 5, 6]
+    assert tree.path(3, 3).tolist() == [3]
 
 
 def test_a_single_node_is_a_tip_without_a_limb():
     point = Skeleton(torch.zeros(1, 3), [], torch.ones(1))
-    assert point.tips.tolist() == [0]
-    assert point.limbs == ()
-    assert point.topology == "()"
-    assert point.limb_lengths.shape == (0,)
-    assert point.limb_ends.shape == (0, 2)
+    assert (point.tips.tolist(), point.limbs, point.topology) == ([0], (), "()")
+    assert (point.limb_lengths.shape, point.limb_ends.shape) == ((0,), (0, 2))
 
 
 @settings(max_examples=60, deadline=None)
@@ -76,68 +62,51 @@ def test_topology_is_equal_exactly_for_isomorphic_trees(numbers, shuffler):
     assert figure([(names[a], names[b]) for a, b in first]).topology == figure(first).topology
 
 
-def test_path_runs_along_the_tree():
-    tree = figure()
-    assert tree.path(0, 6).tolist() == [0, 1, 2, 4, 5, 6]
-    assert tree.path(3, 3).tolist() == [3]
-
-
 def test_resampled_curves_have_equal_steps_and_keep_their_ends():
-    corner = torch.tensor([[0.0, 0, 0], [3, 0, 0], [3, 1, 0]], dtype=torch.float64)
-    turn = se3_exp(torch.tensor([[0, 0, 0, 0, 0, angle] for angle in (0.0, 1.5, 1.5)], dtype=torch.float64))[:, :3, :3]
-    points, radii, frames = resample_curve(corner, torch.tensor([1.0, 4.0, 6.0], dtype=torch.float64), turn, 5)
+    corner = torch.tensor([[0.0, 0, 0], [3, 0, 0], [3, 1, 0]], dtype=D)
+    turn = se3_exp(torch.tensor([[0, 0, 0, 0, 0, angle] for angle in (0.0, 1.5, 1.5)], dtype=D))[:, :3, :3]
+    points, radii, frames = resample_curve(corner, torch.tensor([1.0, 4.0, 6.0], dtype=D), turn, 5)
     assert torch.allclose(points, torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [3, 1, 0]]).double())
     assert radii.tolist() == pytest.approx([1, 2, 3, 4, 6])
-    assert torch.allclose(frames @ frames.mT, torch.eye(3, dtype=torch.float64).expand(5, 3, 3))
+    assert torch.allclose(frames @ frames.mT, torch.eye(3, dtype=D).expand(5, 3, 3))
     assert torch.allclose(frames[[0, 3, 4]], turn)
-    curves, radii, frames = star(5, 3).resample(7)
-    assert curves.shape == (5, 7, 3)
-    assert radii.shape == (5, 7)
-    assert frames.shape == (5, 7, 3, 3)
+    curves, radii, frames = (tree := figure()).resample(7)
+    assert (curves.shape, radii.shape, frames.shape) == ((5, 7, 3), (5, 7), (5, 7, 3, 3))
+    assert torch.allclose(curves[:, [0, -1]], tree.nodes[tree.limb_ends])
 
 
 def test_resampling_is_differentiable_in_points_and_radii():
-    points, radii = random(4, 3, seed=1).requires_grad_(), random(4, seed=2).requires_grad_()
-    eye = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
-    held = points.detach()
-
-    def moved(weights):
-        # The place along the polyline is held fixed, so only moves that keep the steps in proportion are exact.
-        return resample_curve(held * weights, radii, eye, 6)[0]
-
-    assert torch.autograd.gradcheck(moved, torch.ones((), dtype=torch.float64, requires_grad=True))
-    assert torch.autograd.gradcheck(lambda r: resample_curve(held, r, eye, 6)[1], radii)
+    points, radii, eye = randn(4, 3, seed=1), randn(4, seed=2).requires_grad_(), torch.eye(3, dtype=D).expand(4, 3, 3)
+    # The positions along the polyline are constant, so only motions that keep the steps in proportion are exact.
+    scale = torch.ones((), dtype=D, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: resample_curve(points * s, radii, eye, 6)[0], scale)
+    assert torch.autograd.gradcheck(lambda r: resample_curve(points, r, eye, 6)[1], radii)
 
 
 def test_nearest_rotation_is_right_handed_also_from_a_mirror():
-    matrices = torch.cat((random(5, 3, 3), -torch.eye(3, dtype=torch.float64)[None]))
+    matrices = torch.cat((randn(5, 3, 3), -torch.eye(3, dtype=D)[None]))
     turned = nearest_rotation(matrices)
-    assert torch.allclose(turned @ turned.mT, torch.eye(3, dtype=torch.float64).expand(6, 3, 3))
-    assert torch.allclose(torch.linalg.det(turned), torch.ones(6, dtype=torch.float64))
-    others = se3_exp(random(200, 6, seed=3))[:, :3, :3]
+    assert torch.allclose(turned @ turned.mT, torch.eye(3, dtype=D).expand(6, 3, 3))
+    assert torch.allclose(torch.linalg.det(turned), torch.ones(6, dtype=D))
+    others = se3_exp(randn(200, 6, seed=3))[:, :3, :3]
     gain = torch.einsum("bij,bij->b", turned, matrices)
     assert bool((torch.einsum("nij,bij->bn", others, matrices) <= gain[:, None] + 1e-9).all())
 
 
 def test_a_motion_with_scale_moves_nodes_radii_and_frames():
-    tree = figure()
-    motion = se3_exp(random(6, seed=4))
-    motion = rigid_matrix(2 * motion[:3, :3], motion[:3, 3])
-    moved = tree.transformed(motion)
-    assert torch.allclose(moved.limb_lengths, 2 * tree.limb_lengths)
+    tree, motion = figure(), se3_exp(randn(6, seed=4))
+    moved = tree.transformed(rigid_matrix(2 * motion[:3, :3], motion[:3, 3]))
+    assert torch.allclose(moved.nodes, 2 * tree.nodes @ motion[:3, :3].mT + motion[:3, 3])
     assert torch.allclose(moved.radii, 2 * tree.radii)
-    assert torch.allclose(moved.frames, motion[:3, :3] / 2 @ tree.frames)
-    assert moved.topology == tree.topology
+    assert torch.allclose(moved.frames, motion[:3, :3] @ tree.frames)
+    assert torch.equal(moved.edges, tree.edges)
 
 
 def test_limbs_that_share_end_numbers_are_joined():
-    eye = torch.eye(3).expand(3, 3, 3)
-    hub = torch.zeros(3)
-    limbs = [(torch.stack((random(3, seed=k).float(), random(3, seed=9 + k).float(), hub)), hub, eye) for k in range(5)]
+    ends, hub, eye = randn(5, 2, 3), torch.zeros(3, dtype=D), torch.eye(3).expand(3, 3, 3)
+    limbs = [(torch.cat((limb, hub[None])), hub, eye) for limb in ends]
     built = build_skeleton(limbs, [(tip, 42) for tip in range(5)], ["a note"])
-    assert built.topology == "(()()()()())"
-    assert len(built) == 11
-    assert built.notes == ("a note",)
+    assert (built.topology, len(built), built.notes) == ("(()()()()())", 11, ("a note",))
     assert torch.equal(built.nodes[built.limbs[3]], limbs[3][0])
 
 

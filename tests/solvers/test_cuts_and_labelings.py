@@ -149,13 +149,7 @@ def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, c
     generator = torch.Generator().manual_seed(seed)
     costs = torch.rand(3, generator=generator, dtype=torch.float64) if costly else torch.zeros(3)
     given_seams = seam_problem(edges, 3, generator) if seams else {}
-    result = alpha_expansion(
-        unary,
-        edges,
-        weights,
-        label_costs=costs if costly else None,
-        **given_seams,
-    )
+    result = alpha_expansion(unary, edges, weights, label_costs=costs if costly else None, **given_seams)
     problem = (unary, edges, weights, potts(3), costs, *given_seams.values())
     labels = result.labels.tolist()
     assert result.converged

@@ -148,11 +148,7 @@ def test_moving_source_and_target_moves_the_motions_along():
         "target_normals": normals["target_normals"] @ there[:3, :3].T,
     }
     moved = ransac_rigid(
-        transform_points(here, source),
-        transform_points(there, target),
-        threshold=THRESHOLD,
-        num_hypotheses=2,
-        **turned,
+        transform_points(here, source), transform_points(there, target), threshold=THRESHOLD, num_hypotheses=2, **turned
     )
     torch.testing.assert_close(moved.transforms, there @ plain.transforms @ invert_rigid(here), atol=1e-7, rtol=0)
 

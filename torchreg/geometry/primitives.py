@@ -272,11 +272,7 @@ class Superquadric(PrimitiveKind):
     """
 
     name = "superquadric"
-    sizes = (
-        *Ellipsoid.sizes,
-        Size("exponent_1", is_length=False),
-        Size("exponent_2", is_length=False),
-    )
+    sizes = (*Ellipsoid.sizes, Size("exponent_1", is_length=False), Size("exponent_2", is_length=False))
 
     def plane_distance(self, points: Planes, sizes: Tensor) -> Tensor:
         """Return the distances of planes of points; see `PrimitiveKind`."""

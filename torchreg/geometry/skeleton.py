@@ -52,13 +52,7 @@ class Skeleton:
     notes: tuple[str, ...]
 
     def __init__(
-        self,
-        nodes: Any,
-        edges: Any,
-        radii: Any,
-        frames: Any = None,
-        confidence: Any = None,
-        notes: Sequence[str] = (),
+        self, nodes: Any, edges: Any, radii: Any, frames: Any = None, confidence: Any = None, notes: Sequence[str] = ()
     ) -> None:
         nodes = as_float_tensor(nodes, "nodes")
         check_points(nodes, "nodes", batch=False)

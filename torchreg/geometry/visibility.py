@@ -122,13 +122,7 @@ def _used_vertices(mesh: TriangleMesh) -> Tensor:
     return mesh.vertices[used]
 
 
-def visible_points(
-    mesh: TriangleMesh,
-    points: Tensor,
-    camera: Tensor,
-    *,
-    tolerance: float | None = None,
-) -> Tensor:
+def visible_points(mesh: TriangleMesh, points: Tensor, camera: Tensor, *, tolerance: float | None = None) -> Tensor:
     """Return a mask (N,) of the points that a mesh does not hide from a camera; points behind the camera are hidden.
 
     Points up to ``tolerance`` behind the nearest surface are on it, two pixels (of 256) by default.
@@ -169,12 +163,7 @@ def _unhidden(
 
 
 def sample_visible(
-    mesh: TriangleMesh,
-    camera: Tensor,
-    count: int,
-    generator: torch.Generator | None = None,
-    *,
-    density: str = "area",
+    mesh: TriangleMesh, camera: Tensor, count: int, generator: torch.Generator | None = None, *, density: str = "area"
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return ``count`` points drawn from the side of a surface that faces a camera, with faces and barycentric weights.
 

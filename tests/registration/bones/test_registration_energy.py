@@ -174,12 +174,7 @@ MODEL = tr.GridLBS(SparseGrid.from_points(LIMB, 3), torch.ones(SparseGrid.from_p
 @pytest.mark.parametrize(
     ("change", "given", "error", "words"),
     [
-        (
-            {"stiffness": 1.0},
-            (),
-            InputError,
-            "no energy term .stiffness.; known: distance, joint, smoothness, norm",
-        ),
+        ({"stiffness": 1.0}, (), InputError, "no energy term .stiffness.; known: distance, joint, smoothness, norm"),
         ({"joint": -1.0}, (), InputError, "joint must be zero or positive"),
         ({"norm": "1"}, (), InputTypeError, "norm must be a number"),
         ({"point_to_point": 2.0}, (), InputError, "point_to_point must be from 0 to 1"),

@@ -154,11 +154,7 @@ def test_states_of_other_grids_are_refused():
         (lambda s: s.update(grid_cells=s["grid_cells"].double()), InputTypeError, "cells must hold integers"),
         (lambda s: s["grid_axes"].mul_(2), InputError, "axes must be a rotation"),
         (lambda s: s["grid_spacing"].mul_(-1), InputError, "spacing must be positive"),
-        (
-            lambda s: s.update(blend_number=torch.tensor(7)),
-            InputError,
-            "blend_number must be from 0 to 1, got 7",
-        ),
+        (lambda s: s.update(blend_number=torch.tensor(7)), InputError, "blend_number must be from 0 to 1, got 7"),
     ],
 )
 def test_foreign_states_are_refused_by_name(change, error, message):

@@ -16,11 +16,7 @@ from torchreg.registration.results import RegisterRecord
 def reported_weights(config: BoneConfig) -> dict[str, float]:
     """Return the weights of the terms of eq. 2 in records: the same in all steps, so that energies compare."""
     refine = config.refine
-    return term_weights(
-        smoothness=refine.smoothness,
-        norm=refine.normalization,
-        discontinuity=refine.closeness,
-    )
+    return term_weights(smoothness=refine.smoothness, norm=refine.normalization, discontinuity=refine.closeness)
 
 
 def cut_edges(labels: Tensor, data: CellData) -> int:

@@ -32,13 +32,7 @@ def nearest_seed(positions: Tensor, seeds: Tensor) -> Tensor:
 
 
 def reuse_labels(
-    data: CellData,
-    squares: Tensor,
-    labels: Tensor,
-    num_bones: int,
-    *,
-    least_error: float,
-    generator: torch.Generator,
+    data: CellData, squares: Tensor, labels: Tensor, num_bones: int, *, least_error: float, generator: torch.Generator
 ) -> Tensor:
     """Return labels (C,) in which unused labels take over random halves of the regions with the largest errors.
 
