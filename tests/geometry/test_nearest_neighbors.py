@@ -8,13 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.geometry.draws import rand, randn
 from torchreg.geometry import neighbors
 
 
-def clouds(seed, count, size, batch=(), dtype=torch.float64):
-    generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(*batch, count + size, 3, generator=generator, dtype=dtype)
-    return draw[..., :count, :], draw[..., count:, :]
+def clouds(seed, count, size, batch=()):
+    both = rand(*batch, count + size, 3, seed=seed)
+    return both[..., :count, :], both[..., count:, :]
 
 
 def by_loop(points, targets):
@@ -37,8 +37,7 @@ def test_nearest_index_is_brute_force_far_from_the_origin_and_in_chunks(monkeypa
     monkeypatch.setattr(neighbors, "BUDGET", replace(neighbors.BUDGET, distance_entries=chunk))
     if not tree:
         monkeypatch.setattr(neighbors, "_by_tree", neighbors._by_table)
-    generator = torch.Generator().manual_seed(4)
-    points, targets = torch.rand(2, 30, 3, generator=generator), torch.rand(2, 50, 3, generator=generator)
+    points, targets = rand(2, 30, 3, seed=4).float(), rand(2, 50, 3, seed=5).float()
     expected = [by_loop(p, y) for p, y in zip(points, targets.tolist(), strict=True)]
     assert neighbors.nearest_neighbor(points + 100, targets + 100)[0].tolist() == expected
 
@@ -77,18 +76,14 @@ def test_a_broken_problem_leaves_the_others_of_its_batch_alone():
 
 
 def test_the_distance_is_differentiable():
-    points, targets = clouds(7, 5, 6)
-    assert torch.autograd.gradcheck(
-        lambda p, t: neighbors.nearest_neighbor(p, t)[1], (points.requires_grad_(), targets.requires_grad_())
-    )
+    both = [part.requires_grad_() for part in clouds(7, 5, 6)]
+    assert torch.autograd.gradcheck(lambda p, t: neighbors.nearest_neighbor(p, t)[1], both)
 
 
 def grown_cloud(seed, count, size, copies):
-    """Return points of a lattice or at random, many of them more than once, so that distances tie."""
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.rand(count, size, generator=generator, dtype=torch.float64)
-    points = (3 * points).round() if copies else points
-    return points, generator
+    """Points of a lattice or at random, many of them more than once, so that distances tie."""
+    points = rand(count, size, seed=seed)
+    return (3 * points).round() if copies else points
 
 
 def table(points, targets):
@@ -98,9 +93,7 @@ def table(points, targets):
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 25), st.integers(1, 6), st.booleans(), st.integers(1, 25))
 def test_the_k_nearest_are_the_least_of_each_row_of_a_table(seed, count, size, copies, k):
-    targets, generator = grown_cloud(seed, count, size, copies)
-    points = torch.rand(7, size, generator=generator)
-    k = min(k, count)
+    targets, points, k = grown_cloud(seed, count, size, copies), rand(7, size, seed=seed + 1).float(), min(k, count)
     tree = neighbors.NeighborTree(targets)
     index, distance = tree.k_nearest(points, k)
     apart = table(points, targets)
@@ -116,7 +109,7 @@ def test_the_k_nearest_are_the_least_of_each_row_of_a_table(seed, count, size, c
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 25), st.integers(1, 4), st.booleans(), st.integers(1, 30))
 def test_the_nearest_others_leave_out_the_point_itself_alone(seed, count, size, copies, k):
-    points, _ = grown_cloud(seed, count, size, copies)
+    points = grown_cloud(seed, count, size, copies)
     index, distance = neighbors.k_nearest_others(points, k)
     assert index.shape == (count, min(k, count - 1))
     assert not (index == torch.arange(count)[:, None]).any()
@@ -129,7 +122,7 @@ def test_the_nearest_others_leave_out_the_point_itself_alone(seed, count, size, 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 25), st.booleans(), st.floats(0, 2))
 def test_pairs_within_a_radius_are_those_of_a_table(seed, count, copies, radius):
-    points, _ = grown_cloud(seed, count, 3, copies)
+    points = grown_cloud(seed, count, 3, copies)
     near = (table(points, points) <= radius).triu(1)
     assert sorted(neighbors.pairs_within(points, radius).tolist()) == near.nonzero().tolist()
 
@@ -174,13 +167,10 @@ def test_answers_stay_on_the_device_of_the_points():
 
 
 def test_neighbors_beyond_a_radius_are_not_looked_for():
-    generator = torch.Generator().manual_seed(0)
-    points, targets = (torch.randn(300, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    points, targets = randn(300, 3, seed=1), randn(300, 3, seed=2)
     index, distance = neighbors.NeighborTree(targets).nearest_within(points, 0.3)
     truth = torch.cdist(points, targets).min(-1)
     near = truth.values < 0.3
     assert 10 < int(near.sum()) < 290
-    torch.testing.assert_close(index[near], truth.indices[near])
-    torch.testing.assert_close(distance[near], truth.values[near])
-    assert bool(distance[~near].isinf().all())
-    assert index[~near].unique().tolist() == [0]
+    torch.testing.assert_close(index, torch.where(near, truth.indices, 0))
+    torch.testing.assert_close(distance, torch.where(near, truth.values, torch.inf))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.geometry.draws import D, rand, randn, sheet_faces
 from torchreg.datasets.solids import RoundBox, RoundCone, mesh_of
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
@@ -13,7 +14,7 @@ from torchreg.geometry.support import split_support
 
 LEGS = [RoundCone((0.5 * x, 0.1, 0.3 * z), (0.4 * x, 0.9, 0.2 * z), 0.1, 0.13) for x in (-1, 1) for z in (-1, 1)]
 ANIMAL = [*LEGS, RoundCone((-0.6, 1, 0), (0.7, 1, 0), 0.25, 0.25), RoundCone((0.7, 1, 0), (1.1, 1.5, 0), 0.12, 0.15)]
-TURN = se3_exp(torch.tensor([3.0, -2.0, 7.0, 0.9, -1.3, 0.6], dtype=torch.float64))
+TURN = se3_exp(torch.tensor([3.0, -2.0, 7.0, 0.9, -1.3, 0.6], dtype=D))
 
 
 def solid(*parts):
@@ -29,26 +30,18 @@ def animal():
 
 def sheet(half, height=0.0, count=30):
     """A square table top as a grid of triangles."""
-    steps = torch.linspace(-half, half, count, dtype=torch.float64)
-    x, z = (rows.reshape(-1) for rows in torch.meshgrid(steps, steps, indexing="ij"))
-    corner = torch.arange(count * count).reshape(count, count)[:-1, :-1].reshape(-1)
-    faces = (
-        torch.stack((corner, corner + 1, corner + count), 1),
-        torch.stack((corner + 1, corner + count + 1, corner + count), 1),
-    )
-    return TriangleMesh(torch.stack((x, torch.full_like(x, height), z), 1), torch.cat(faces))
+    steps = torch.linspace(-half, half, count, dtype=D)
+    corners = torch.cartesian_prod(steps, torch.tensor([height], dtype=D), steps)
+    return TriangleMesh(corners, sheet_faces(count, count))
 
 
 def disc(radius, count, height=0.0):
-    share = torch.rand(count, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    angle, reach = 2 * math.pi * share[:, 0], radius * share[:, 1].sqrt()
+    angle, reach = 2 * math.pi * rand(count, seed=1), radius * rand(count, seed=2).sqrt()
     return torch.stack((reach * angle.cos(), torch.full_like(reach, height), reach * angle.sin()), 1)
 
 
-def noise(points, deviation, seed=0):
-    return points + deviation * torch.randn(
-        points.shape, dtype=points.dtype, generator=torch.Generator().manual_seed(seed)
-    )
+def noise(points, deviation):
+    return points + deviation * randn(*points.shape)
 
 
 def after(animal, mask):
@@ -93,7 +86,7 @@ def test_tables_of_other_makes_are_found_too(animal, support):
 
 
 @pytest.mark.parametrize("top_only", [False, True])
-def test_a_table_that_is_one_with_the_feet_is_cut_off(animal, top_only):
+def test_a_table_that_is_one_with_the_feet_is_cut_off(top_only):
     mesh = solid(*ANIMAL, RoundBox((0, -0.1, 0), (1.8, 0.1, 1.8), 0.01))
     if top_only:  # as a scanner sees it
         mesh = RangeScan(mesh.vertices, mesh.faces).subset(mesh.vertices[:, 1] > -0.01)

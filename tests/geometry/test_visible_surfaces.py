@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.geometry.draws import D, rand, randn
 from torchreg.errors import InputError
 from torchreg.geometry import visibility, z_buffer
 from torchreg.geometry.mesh import TriangleMesh, concatenate, interpolate, unit_sphere
@@ -14,20 +15,18 @@ from torchreg.geometry.visibility import aim, rasterize, sample_visible, view_ro
 CAMERA = torch.tensor([0.0, 0.0, -3.0])
 
 
-def quad(z, half=1.0, center=(0.0, 0.0)):
+def quad(z, half=1.0):
     """A square at depth z that looks back along -z."""
-    x, y = center
-    corners = [[x - half, y - half, z], [x - half, y + half, z], [x + half, y + half, z], [x + half, y - half, z]]
-    return TriangleMesh(torch.tensor(corners, dtype=torch.float64), torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    corners = [[-half, -half, z], [-half, half, z], [half, half, z], [half, -half, z]]
+    return TriangleMesh(torch.tensor(corners, dtype=D), torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
 def cast_rays(mesh, origins, directions):
     """Nearest hit (distance along each ray, face), triangle by triangle with Cramer's rule."""
-    best = torch.full((len(origins),), math.inf, dtype=torch.float64)
+    best = torch.full((len(origins),), math.inf, dtype=D)
     face_of = torch.full((len(origins),), -1)
     for index, (a, b, c) in enumerate(mesh.vertices[mesh.faces]):
-        system = torch.stack([b - a, c - a, torch.zeros(3, dtype=torch.float64)], dim=-1).repeat(len(origins), 1, 1)
-        system[:, :, 2] = -directions
+        system = torch.stack(torch.broadcast_tensors(b - a, c - a, -directions), dim=-1)
         u, v, t = torch.linalg.solve(system, origins - a).unbind(-1)
         hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t < best) & (t > 0)
         best[hit], face_of[hit] = t[hit], index
@@ -37,55 +36,35 @@ def cast_rays(mesh, origins, directions):
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
 def test_view_rotation_looks_at_the_target_with_up_upwards(seed):
-    camera, target, up = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    camera, target, up = randn(3, 3, seed=seed)
     rotation = view_rotation(camera, target, up)
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=D))
     assert float(rotation.det()) == pytest.approx(1.0)
-    seen = rotation @ (target - camera)
-    torch.testing.assert_close(seen[:2], torch.zeros(2, dtype=torch.float64), atol=1e-12, rtol=0)
+    seen, upright = rotation @ (target - camera), rotation @ up
+    torch.testing.assert_close(seen[:2], torch.zeros(2, dtype=D), atol=1e-12, rtol=0)
     assert seen[2] > 0
-    upright = rotation @ up
     assert abs(float(upright[0])) < 1e-12
     assert upright[1] < 0
-
-
-def test_project_divides_by_depth():
-    square = quad(1.0).vertices
-    view = aim(square, torch.zeros(3), size=100)
-    assert (view.width, view.height) == (100, 100)
-    pixels, depth = view.project(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 2.0], [-1.0, 1.0, 1.0], [0.0, 0.0, -1.0]]))
-    expected = torch.tensor([[50.0, 50.0], [75.0, 50.0], [0.0, 100.0]], dtype=torch.float64)
-    torch.testing.assert_close(pixels[:3], expected)
-    assert pixels[3].isnan().all()
-    torch.testing.assert_close(depth, torch.tensor([1.0, 2.0, 1.0, -1.0], dtype=torch.float64))
-    torch.testing.assert_close(view.footprint(depth[:2]), torch.tensor([0.02, 0.04], dtype=torch.float64))
-
-
-def test_a_parallel_view_keeps_sizes():
-    view = aim(quad(1.0).vertices, torch.tensor([0.0, 0.0, 5.0]), parallel=True, size=(200, 100), margin=0.1)
-    near, _ = view.project(torch.tensor([[1.0, 0.0, 1.0]]))
-    far, _ = view.project(torch.tensor([[1.0, 0.0, 9.0]]))
-    torch.testing.assert_close(near, far)
-    torch.testing.assert_close(near, torch.tensor([[140.0, 50.0]], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 @pytest.mark.parametrize("size", [64, (40, 90)])
 def test_aim_frames_every_point(parallel, size):
-    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
+    points = randn(50, 3, seed=1)
     view = aim(points, torch.tensor([2.0, -9.0, 4.0]), parallel=parallel, size=size, margin=0.05)
-    pixels, _ = view.project(points)
-    assert bool((pixels > 0).all())
-    assert bool((pixels < torch.tensor([view.width, view.height])).all())
+    pixels, depth = view.project(points)
+    limit = torch.tensor([view.width, view.height])
+    assert bool((pixels > 0.045 * limit).all() & (pixels < 0.955 * limit).all())
+    assert float(((pixels - limit / 2).abs() / limit).max()) == pytest.approx(0.45, abs=0.01)
     assert max(view.width, view.height) == (64 if size == 64 else 90)
+    expected = view.pitch if parallel else view.pitch * depth
+    torch.testing.assert_close(view.footprint(depth), torch.as_tensor(expected, dtype=D).expand(50))
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_rasterize_agrees_with_rays_cast_at_every_triangle(parallel):
-    generator = torch.Generator().manual_seed(3)
-    vertices = torch.randn(60, 3, generator=generator, dtype=torch.float64)
+    vertices, camera = randn(60, 3, seed=3), torch.tensor([1.0, 2.0, -8.0], dtype=D)
     mesh = TriangleMesh(vertices, torch.arange(60).reshape(20, 3))
-    camera = torch.tensor([1.0, 2.0, -8.0], dtype=torch.float64)
     view = aim(vertices, camera, parallel=parallel, size=24)
     raster = rasterize(mesh, view)
     rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")
@@ -93,15 +72,14 @@ def test_rasterize_agrees_with_rays_cast_at_every_triangle(parallel):
     plane = plane * view.pitch + view.corner
     one = torch.ones_like(plane[:, :1])
     if parallel:
-        directions = (view.rotation.mT @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).expand(len(plane), 3)
+        directions = view.rotation[2].expand(len(plane), 3)
         origins = view.position + torch.cat([plane, -20 * one], dim=-1) @ view.rotation
     else:
         directions = torch.cat([plane, one], dim=-1) @ view.rotation
         origins = camera.expand(len(plane), 3)
     distance, face = cast_rays(mesh, origins, directions)
-    depth = distance - (20 if parallel else 0)
     torch.testing.assert_close(raster.face_index.reshape(-1), face)
-    torch.testing.assert_close(raster.depth.reshape(-1), depth)
+    torch.testing.assert_close(raster.depth.reshape(-1), distance - (20 if parallel else 0))
     hit = face >= 0
     assert 0.2 < float(hit.double().mean()) < 1
     there = interpolate(vertices, mesh.faces, face[hit], raster.barycentric.reshape(-1, 3)[hit])
@@ -109,14 +87,13 @@ def test_rasterize_agrees_with_rays_cast_at_every_triangle(parallel):
 
 
 def test_rasterizing_in_chunks_changes_nothing(monkeypatch):
-    mesh = concatenate([unit_sphere(2, dtype=torch.float64), quad(-1.2, 0.5)])
+    mesh = concatenate([unit_sphere(2, dtype=D), quad(-1.2, 0.5)])
     view = aim(mesh.vertices, CAMERA, size=40)
     whole = rasterize(mesh, view)
     monkeypatch.setattr(z_buffer, "BUDGET", replace(z_buffer.BUDGET, raster_pixels=100))
     parts = rasterize(mesh, view)
-    torch.testing.assert_close(parts.face_index, whole.face_index)
-    torch.testing.assert_close(parts.barycentric, whole.barycentric)
-    torch.testing.assert_close(parts.depth, whole.depth)
+    for name in ("face_index", "barycentric", "depth"):
+        torch.testing.assert_close(getattr(parts, name), getattr(whole, name))
 
 
 def test_culling_drops_faces_seen_from_behind():
@@ -148,12 +125,10 @@ def test_points_before_beside_behind_and_behind_the_camera():
 
 
 def test_a_slanted_surface_does_not_hide_itself():
-    sheet = quad(0.0)
     tilt = math.radians(84)
-    turn = torch.tensor([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
-    slanted = TriangleMesh(sheet.vertices @ turn.double().mT, sheet.faces)
-    weights = torch.rand(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1.9 - 0.95
-    points = torch.nn.functional.pad(weights, (0, 1)) @ turn.double().mT
+    turn = torch.tensor([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]).double()
+    slanted = TriangleMesh(quad(0.0).vertices @ turn.mT, quad(0.0).faces)
+    points = torch.nn.functional.pad(rand(200, 2) * 1.9 - 0.95, (0, 1)) @ turn.mT
     assert bool(visible_points(slanted, points, CAMERA, tolerance=1e-6).all())
 
 
@@ -187,13 +162,12 @@ def test_hidden_parts_give_no_samples():
 
 
 def test_samples_are_differentiable_in_the_vertices():
-    sphere = unit_sphere(1, dtype=torch.float64)
+    sphere = unit_sphere(1, dtype=D)
     vertices = sphere.vertices.clone().requires_grad_()
     points, face, weights = sample_visible(TriangleMesh(vertices, sphere.faces), CAMERA, 10)
     points.sum().backward()
-    expected = torch.zeros(len(vertices), dtype=torch.float64).index_add(
-        0, sphere.faces[face].reshape(-1), weights.reshape(-1)
-    )
+    corners = sphere.faces[face].reshape(-1)
+    expected = torch.zeros(len(vertices), dtype=D).index_add(0, corners, weights.reshape(-1))
     torch.testing.assert_close(vertices.grad, expected[:, None].expand(-1, 3))
 
 
