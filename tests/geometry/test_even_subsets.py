@@ -5,27 +5,19 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
+from tests.geometry.draws import directions, rand, seeded
 from torchreg.geometry.poisson_disk import poisson_disk, poisson_disk_count
 from torchreg.geometry.sampling import draw_spread, even_order, farthest_points
 
 
 def cloud(count, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.randn(count, 3, generator=generator)
-    return points / points.norm(dim=-1, keepdim=True)
-
-
-def nearest(points):
-    return cKDTree(points.numpy()).query(points.numpy(), 2)[0][:, 1]
+    return directions(count, seed).float()
 
 
 def test_the_rule_walked_point_by_point():
-    points, radius = cloud(150).double(), 0.25
-    order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
-    kept = []
-    for index in order.tolist():
+    points, radius, kept = cloud(150).double(), 0.25, []
+    for index in torch.randperm(150, generator=seeded()).tolist():
         if all(float((points[index] - points[other]).norm()) > radius for other in kept):
             kept.append(index)
     assert poisson_disk(points, radius).tolist() == sorted(kept)
@@ -58,70 +50,57 @@ def test_as_many_as_asked_for(size, count, seed, doubles):
 
 
 def test_a_count_is_spread_far_better_than_at_random():
-    points = cloud(5000)
-    few = poisson_disk_count(points, 400)
-    spread, random = nearest(points[few]), nearest(points[:400])
-    assert spread.min() > 0.6 * np.sqrt(4 * np.pi / 400)
-    assert spread.min() > 10 * random.min()
-    reach = cKDTree(points[few].numpy()).query(points.numpy())[0].max()
-    assert reach < 1.3 * np.sqrt(4 * np.pi / 400)
+    points = cloud(5000).double()
+    few, even = poisson_disk_count(points, 400), np.sqrt(4 * np.pi / 400)
+    spread, random = (torch.cdist(p, p).fill_diagonal_(torch.inf).min() for p in (points[few], points[:400]))
+    assert spread > max(0.6 * even, 10 * random)
+    assert torch.cdist(points, points[few]).amin(1).max() < 1.3 * even
 
 
 def test_the_generator_decides():
     points = cloud(500)
-    assert torch.equal(poisson_disk(points, 0.3), poisson_disk(points, 0.3))
-    other = poisson_disk(points, 0.3, torch.Generator().manual_seed(5))
-    assert not torch.equal(poisson_disk(points, 0.3), other)
-    assert torch.equal(other, poisson_disk(points, 0.3, torch.Generator().manual_seed(5)))
+    first, again, other, same = (poisson_disk(points, 0.3, g) for g in (None, None, seeded(5), seeded(5)))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert torch.equal(other, same)
 
 
-def sampled_cloud(count, seed=0):
-    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def test_each_point_is_the_farthest_from_those_before():
-    points = sampled_cloud(60)
+def test_each_point_is_the_farthest_from_those_before_also_in_the_even_order():
+    points = rand(60, 3)
     chosen = farthest_points(points, 20, start=7)
     assert chosen[0] == 7
     for k in range(1, 20):
         gaps = torch.cdist(points, points[chosen[:k]]).amin(-1)
         assert gaps[chosen[k]] == gaps.max()
+    order = even_order(points)
+    assert int(order[0]) == int((points - points.mean(0)).norm(dim=-1).argmax())
+    assert torch.equal(order, farthest_points(points, 60, int(order[0])))
+    assert torch.equal(even_order((points + 1000).float()).sort().values, torch.arange(60))
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 30), st.data())
 def test_indices_are_all_different_also_among_duplicates(size, data):
     count = data.draw(st.integers(1, size))
-    points = sampled_cloud(size).mul(2).round()
+    points = rand(size, 3).mul(2).round()
     chosen = farthest_points(points, count)
     assert chosen.dtype == torch.int64
-    assert len(set(chosen.tolist())) == count
-    distinct = len(torch.unique(points, dim=0))
-    assert len(torch.unique(points[chosen], dim=0)) == min(count, distinct)
-
-
-def test_the_even_order_chooses_the_farthest_each_time():
-    points = sampled_cloud(60)
-    order = even_order(points)
-    assert torch.equal(order.sort().values, torch.arange(60))
-    assert int(order[0]) == int((points - points.mean(0)).norm(dim=-1).argmax())
-    assert torch.equal(order, farthest_points(points, 60, int(order[0])))
-    shifted = even_order((points + 1000).float())
-    assert torch.equal(shifted.sort().values, torch.arange(60))
+    assert len(chosen.unique()) == count
+    assert len(points[chosen].unique(dim=0)) == min(count, len(points.unique(dim=0)))
 
 
 # Draws in which no crowded place outvotes others
 
 
 def drawn(points, count, seed=0):
-    index = draw_spread(points, count, 2.0, torch.Generator().manual_seed(seed))
+    index = draw_spread(points, count, 2.0, seeded(seed))
     assert len(index.unique()) == count
     assert torch.equal(index, index.sort().values)
     return index
 
 
 def test_points_that_lie_evenly_are_drawn_as_at_random_and_thin_outliers_stay_thin():
-    points = torch.cat([cloud(20_000), 3 * torch.rand(5000, 3, generator=torch.Generator().manual_seed(1))])
+    points = torch.cat([cloud(20_000), 3 * rand(5000, 3, seed=1).float()])
     index = drawn(points, 4000)
     assert float((index >= 20_000).double().mean()) == pytest.approx(0.2, abs=0.02)
     # Each half of the ball as often.
@@ -131,7 +110,7 @@ def test_points_that_lie_evenly_are_drawn_as_at_random_and_thin_outliers_stay_th
 
 @pytest.mark.parametrize("spread", [0.0, 0.03])
 def test_a_clump_of_most_points_is_drawn_as_one_place_of_many(spread):
-    clump = torch.tensor([0.0, 0.0, 1.0]) + spread * torch.rand(95_000, 3, generator=torch.Generator().manual_seed(1))
+    clump = torch.tensor([0.0, 0.0, 1.0]) + spread * rand(95_000, 3, seed=1).float()
     index = drawn(torch.cat([cloud(5000), clump]), 2000)
     # The clump fills up to eight cubes of the two hundred or more that count.
     assert 0 < float((index >= 5000).double().mean()) < 0.05

@@ -3,15 +3,21 @@ import math
 import pytest
 import torch
 
+from tests.geometry.draws import D, box_mesh
 from torchreg.errors import InputError
+from torchreg.geometry.creases import welded
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.surface_graph import close_holes, coarsened, one_piece, unique_edges
 
 
 def ball(subdivisions=2, radius=1.0, at=(0.0, 0.0, 0.0)):
-    mesh = unit_sphere(subdivisions, dtype=torch.float64)
-    return TriangleMesh(radius * mesh.vertices + torch.tensor(at, dtype=torch.float64), mesh.faces)
+    mesh = unit_sphere(subdivisions, dtype=D)
+    return TriangleMesh(radius * mesh.vertices + torch.tensor(at, dtype=D), mesh.faces)
+
+
+def soup(mesh):
+    return mesh.vertices[mesh.faces].reshape(-1, 3), torch.arange(mesh.faces.numel()).reshape(-1, 3)
 
 
 def euler_number(mesh):
@@ -27,12 +33,21 @@ def test_edges_of_a_tetrahedron():
 
 
 def test_separate_triangles_are_welded_and_repeated_ones_dropped():
-    mesh = ball()
-    soup = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), torch.arange(3 * mesh.num_faces).reshape(-1, 3))
-    again = TriangleMesh(soup.vertices, torch.cat((soup.faces, soup.faces[:7].flip(1), soup.faces[:3, [0, 0, 1]])))
+    vertices, faces = soup(ball())
+    again = TriangleMesh(vertices, torch.cat((faces, faces[:7].flip(1), faces[:3, [0, 0, 1]])))
     whole = one_piece(again)
     assert (whole.mesh.num_vertices, whole.mesh.num_faces) == (162, 320)
     assert torch.equal(whole.mesh.vertices, again.vertices[whole.vertex])
+
+
+def test_welded_spheres_are_smooth_and_edges_of_cubes_stay_sharp():
+    for mesh, count in ((unit_sphere(3, dtype=D), 642), (box_mesh(), 24)):  # a cube's corner has three normals
+        vertices, faces = soup(mesh)
+        kept, indexed, normals = welded(vertices, faces)
+        assert len(kept) == count
+        torch.testing.assert_close(vertices[kept][indexed], vertices[faces])
+        smooth = float((normals.double() * vertices[kept]).sum(-1).min()) > 0.995
+        assert smooth if count == 642 else bool((normals.abs().amax(-1) == 1).all())
 
 
 def test_pieces_by_policy():
@@ -52,12 +67,12 @@ def test_pieces_by_policy():
 
 
 def test_dust_is_no_reason_for_an_error():
-    mesh = concatenate([ball(4), TriangleMesh(torch.eye(3, dtype=torch.float64) + 5, torch.tensor([[0, 1, 2]]))])
+    mesh = concatenate([ball(4), TriangleMesh(torch.eye(3, dtype=D) + 5, torch.tensor([[0, 1, 2]]))])
     assert one_piece(mesh, "error").mesh.num_faces == 5120
     assert one_piece(mesh, "bridge").bridges.shape == (0, 2)
 
 
-def test_holes_are_closed():
+def test_holes_are_closed_whatever_the_winding():
     mesh = ball(3)
     upper = mesh.vertices[mesh.faces].mean(1)[:, 2]
     whole = one_piece(TriangleMesh(mesh.vertices, mesh.faces[upper.abs() < 0.7]))
@@ -66,9 +81,11 @@ def test_holes_are_closed():
     middles = whole.mesh.vertices[whole.vertex < 0]
     assert middles[:, :2].abs().max() < 0.05
     assert sorted(middles[:, 2].sign().tolist()) == [-1, 1]
-    vertices, _, count = close_holes(mesh.vertices, mesh.faces)
-    assert count == 0
-    assert vertices is mesh.vertices
+    flipped = torch.where(torch.arange(mesh.num_faces)[:, None] % 3 == 0, mesh.faces.flip(1), mesh.faces)
+    for faces in (mesh.faces, flipped):
+        vertices, _, count = close_holes(mesh.vertices, faces)
+        assert (count, close_holes(mesh.vertices, faces[1:])[2]) == (0, 1)
+        assert vertices is mesh.vertices
 
 
 def test_coarse_surfaces_keep_place_and_topology():
@@ -82,25 +99,14 @@ def test_coarse_surfaces_keep_place_and_topology():
 
 
 def test_sheets_closer_than_a_cell_stay_apart_and_thin_tubes_stay_tubes():
-    turn = torch.linspace(0, 2 * math.pi, 9, dtype=torch.float64)[:8]
-    height = torch.linspace(0, 4, 400, dtype=torch.float64)
+    turn, height = torch.arange(8, dtype=D) * math.pi / 4, torch.linspace(0, 4, 400, dtype=D)
     ring = 0.002 * torch.stack((turn.cos(), turn.sin()), dim=1)
     tube = torch.cat((ring.repeat(400, 1), height.repeat_interleave(8)[:, None]), dim=1)
-    at = torch.arange(399).repeat_interleave(8) * 8
-    here, there = torch.arange(8).repeat(399), (torch.arange(8).repeat(399) + 1) % 8
-    faces = torch.stack((at + here, at + there, at + 8 + here), 1)
-    faces = torch.cat((faces, torch.stack((at + there, at + 8 + there, at + 8 + here), 1)))
-    outer, inner = ball(5), ball(5, 0.999)
-    mesh = concatenate([outer, inner, TriangleMesh(tube + 3, faces)])
-    few = coarsened(mesh, 3000)
+    row = torch.arange(399).repeat_interleave(8) * 8
+    start, end = torch.arange(8).repeat(399), (torch.arange(8).repeat(399) + 1) % 8
+    lower = torch.stack((row + start, row + end, row + 8 + start), 1)
+    faces = torch.cat((lower, torch.stack((row + end, row + 8 + end, row + 8 + start), 1)))
+    few = coarsened(concatenate([ball(5), ball(5, 0.999), TriangleMesh(tube + 3, faces)]), 3000)
     labels = connected_components(torch.cat((few.faces[:, :2], few.faces[:, 1:])), few.num_vertices)
     assert len(labels.unique()) == 3
     assert few.vertices[:, 2].max() == pytest.approx(7.0, abs=0.06)
-
-
-def test_holes_are_seen_whatever_the_winding():
-    closed = ball()
-    flipped = torch.where(torch.arange(closed.num_faces)[:, None] % 3 == 0, closed.faces.flip(1), closed.faces)
-    assert close_holes(closed.vertices, flipped)[2] == 0
-    for faces in (closed.faces[1:], flipped[1:]):
-        assert close_holes(closed.vertices, faces)[2] == 1

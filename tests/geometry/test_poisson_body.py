@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from experiments.made_up.bodies import person
+from tests.geometry.draws import D, randn, seeded, volume
 from torchreg.geometry.joined_pieces import join_pieces
 from torchreg.geometry.mesh import sample_surface, unit_sphere
 from torchreg.geometry.neighbors import NeighborTree
@@ -14,14 +15,7 @@ from torchreg.geometry.voxels import voxelize
 
 
 def noisy_ball(count):
-    generator = torch.Generator().manual_seed(0)
-    points = sample_surface(unit_sphere(3, dtype=torch.float64), count, generator)[0]
-    return points + 0.005 * torch.randn(points.shape, generator=generator, dtype=points.dtype)
-
-
-def volume(mesh):
-    a, b, c = mesh.vertices[mesh.faces].unbind(1)
-    return float((a * torch.linalg.cross(b, c)).sum() / 6)
+    return sample_surface(unit_sphere(3, dtype=D), count, seeded())[0] + 0.005 * randn(count, 3)
 
 
 def test_points_of_a_ball_make_a_ball_that_faces_outwards():
@@ -41,19 +35,18 @@ def test_a_hole_is_closed_and_a_cap_shows_no_far_side():
     assert poisson_body(points[points[:, 2] < -0.3]).shown < 0.3
 
 
-def test_a_limb_that_a_gap_cuts_is_joined_and_what_floats_far_away_is_not():
+@pytest.mark.parametrize(
+    ("spans", "thick", "expected"),
+    [(((1, 20), (24, 32)), 1, 1), (((1, 20), (37, 39)), 1, 0), (((1, 19), (21, 39)), 3, 0), ((), 0, 0)],
+    ids=["a cut limb", "far away", "another body", "nothing"],
+)
+def test_a_limb_that_a_gap_cuts_is_joined_and_what_floats_far_away_is_not(spans, thick, expected):
     inside = torch.zeros(40, 12, 12, dtype=torch.bool)
-    inside[1:20, 3:9, 3:9] = inside[24:32, 5:7, 5:7] = True
+    for (start, end), half in zip(spans, (3, thick), strict=False):
+        inside[start:end, 6 - half : 6 + half, 6 - half : 6 + half] = True
     bars, number = join_pieces(inside)
-    assert number == 1
-    assert bool(bars[20:24, 5:7, 5:7].any(-1).any(-1).all())
-    far = torch.zeros_like(inside)
-    far[1:20, 3:9, 3:9] = far[37:39, 5:7, 5:7] = True
-    assert join_pieces(far)[1] == 0
-    another = torch.zeros_like(inside)
-    another[1:19, 3:9, 3:9] = another[21:39, 3:9, 3:9] = True
-    assert join_pieces(another)[1] == 0
-    assert join_pieces(torch.zeros_like(inside))[1] == 0
+    assert number == expected
+    assert bool(bars[20:24, 5:7, 5:7].any(-1).any(-1).all()) == (expected == 1)
 
 
 def test_two_thin_bodies_near_each_other_stay_apart():
@@ -66,12 +59,11 @@ def test_two_thin_bodies_near_each_other_stay_apart():
 
 def test_thin_hands_and_feet_are_not_inside_out():
     body = voxelize(person().mesh, 80).mesh()
-    generator = torch.Generator().manual_seed(0)
-    points = sample_surface(body, 4000, generator)[0].double()
+    points = sample_surface(body, 4000, seeded())[0].double()
     diagonal = float((points.amax(0) - points.amin(0)).norm())
-    points = points + 0.002 * diagonal * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+    points = points + 0.002 * diagonal * randn(4000, 3)
     found = poisson_body(points).mesh
     # Where normals point inwards the surface is a bubble around the limb, far from the points.
     far = NeighborTree(points).nearest(found.vertices)[1] > 0.03 * diagonal
     assert float(far.double().mean()) < 0.003
-    assert volume(found) == pytest.approx(float(volume(body)), rel=0.05)
+    assert volume(found) == pytest.approx(volume(body), rel=0.05)

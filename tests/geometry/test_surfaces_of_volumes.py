@@ -35,7 +35,10 @@ def cube(size, dtype=D):
 
 def by_cubes(field, lower, upper, spacing):
     """The surface of a field by marching cubes."""
-    axes = [torch.arange(float(a), float(b) + spacing, spacing, dtype=lower.dtype) for a, b in zip(lower, upper, strict=True)]
+    axes = [
+        torch.arange(float(a), float(b) + spacing, spacing, dtype=lower.dtype)
+        for a, b in zip(lower, upper, strict=True)
+    ]
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
     return marching_cubes(field(points), lower, spacing)
 
