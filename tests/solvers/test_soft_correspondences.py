@@ -10,14 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.geometry.draws import D, rand
 from torchreg.solvers import e_step as em
 
-D = torch.float64
 FIELDS = ("weights", "targets", "inlier_posterior", "squared_error")
 
 
 def cloud(*shape, seed=0, dtype=D):
-    return torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed), dtype=D).to(dtype)
+    return rand(*shape, 3, seed=seed).to(dtype)
 
 
 def by_loops(model, data, sigma, c):
@@ -35,25 +35,25 @@ def by_loops(model, data, sigma, c):
     return alpha, weights, targets, inlier, squares
 
 
-def assert_same(one, other, **tolerance):
+def assert_same(first, second, index=..., **tolerance):
     for field in FIELDS:
         torch.testing.assert_close(
-            getattr(one, field), getattr(other, field), **tolerance, msg=lambda m, f=field: f + m
+            getattr(first, field)[index], getattr(second, field), **tolerance, msg=lambda m, f=field: f + m
         )
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, D])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(torch.float32, {"atol": 1e-5, "rtol": 1e-4}), (D, {"atol": 1e-12, "rtol": 1e-12})]
+)
 @pytest.mark.parametrize("sigma", [0.1, 0.5])
-def test_the_e_step_is_the_papers(dtype, sigma):
+def test_the_e_step_is_the_papers(dtype, tolerance, sigma):
     model, data = cloud(7), cloud(11, seed=1)
-    alpha, *expected = by_loops(model.tolist(), data.tolist(), sigma, 2.5)
-    step = em.expectation(model.to(dtype), data.to(dtype), torch.tensor(sigma, dtype=dtype), 2.5)
-    tol = {"atol": 1e-5, "rtol": 1e-4} if dtype == torch.float32 else {"atol": 1e-12, "rtol": 1e-12}
-    for field, value in zip(FIELDS, expected, strict=True):
-        assert getattr(step, field).dtype == dtype
-        torch.testing.assert_close(getattr(step, field), torch.tensor(value, dtype=dtype), **tol)
-    dense = em.posterior(model.to(dtype), data.to(dtype), torch.tensor(sigma, dtype=dtype), 2.5)
-    torch.testing.assert_close(dense, torch.tensor(alpha, dtype=dtype), **tol)
+    expected = by_loops(model.tolist(), data.tolist(), sigma, 2.5)
+    inputs = (model.to(dtype), data.to(dtype), torch.tensor(sigma, dtype=dtype), 2.5)
+    step = em.expectation(*inputs)
+    for found, value in zip((em.posterior(*inputs), *(getattr(step, f) for f in FIELDS)), expected, strict=True):
+        assert found.dtype == dtype
+        torch.testing.assert_close(found, torch.tensor(value, dtype=dtype), **tolerance)
 
 
 @settings(max_examples=25, deadline=None)
@@ -72,12 +72,11 @@ def test_the_chunked_e_step_sums_the_dense_posterior(n, m, sigma, c, seed):
 
 @pytest.mark.parametrize("entries", [1, 7, 50, 10_000])
 def test_chunks_do_not_change_the_answer(monkeypatch, entries):
-    model, data = cloud(3, 6), cloud(3, 9, seed=1)
-    mask = torch.rand(3, 9, generator=torch.Generator().manual_seed(2)) > 0.3
     sigma, c = torch.tensor([0.1, 0.2, 0.4], dtype=D), torch.tensor([1.0, 2.0, 3.0], dtype=D)
-    whole = em.expectation(model, data, sigma, c, mask=mask)
+    inputs, mask = (cloud(3, 6), cloud(3, 9, seed=1), sigma, c), rand(3, 9, seed=2) > 0.3
+    whole = em.expectation(*inputs, mask=mask)
     monkeypatch.setattr(em, "BUDGET", replace(em.BUDGET, table_entries=entries))
-    assert_same(em.expectation(model, data, sigma, c, mask=mask), whole)
+    assert_same(em.expectation(*inputs, mask=mask), whole)
 
 
 def test_a_datum_on_an_isolated_model_point_is_held_by_a_fifth():
@@ -119,18 +118,16 @@ def test_far_outliers_get_nothing_and_move_nothing(dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_a_batch_is_a_loop(dtype):
-    model, data = cloud(2, 3, 5, dtype=dtype), cloud(2, 3, 7, seed=1, dtype=dtype)
-    sigma = torch.linspace(0.1, 0.6, 6, dtype=dtype).reshape(2, 3)
-    c = torch.linspace(1, 3, 6, dtype=dtype).reshape(2, 3)
-    mask = torch.rand(2, 3, 7, generator=torch.Generator().manual_seed(2)) > 0.3
-    together = em.expectation(model, data, sigma, c, mask=mask)
-    dense = em.posterior(model, data, sigma, c, mask=mask)
-    for b in range(2):
-        for k in range(3):
-            alone = em.expectation(model[b, k], data[b, k], sigma[b, k], c[b, k], mask=mask[b, k])
-            for field in FIELDS:
-                torch.testing.assert_close(getattr(together, field)[b, k], getattr(alone, field), rtol=1e-4, atol=1e-5)
-            torch.testing.assert_close(dense[b, k].sum(-1), alone.weights, rtol=1e-4, atol=1e-5)
+    sigma, c = (torch.linspace(*ends, 6, dtype=dtype).reshape(2, 3) for ends in ((0.1, 0.6), (1, 3)))
+    inputs, mask = (
+        (cloud(2, 3, 5, dtype=dtype), cloud(2, 3, 7, seed=1, dtype=dtype), sigma, c),
+        rand(2, 3, 7, seed=2) > 0.3,
+    )
+    together, dense = em.expectation(*inputs, mask=mask), em.posterior(*inputs, mask=mask)
+    for index in ((b, k) for b in range(2) for k in range(3)):
+        alone = em.expectation(*(value[index] for value in inputs), mask=mask[index])
+        assert_same(together, alone, index, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(dense[index].sum(-1), alone.weights, rtol=1e-4, atol=1e-5)
 
 
 def test_float32_is_right_far_from_the_origin():
@@ -147,13 +144,13 @@ def test_float32_is_right_far_from_the_origin():
 @pytest.mark.parametrize("ratio", [10.0, 100.0, 127.0, 1e3, 1e5])
 def test_both_forms_of_the_square_are_exact_enough_in_float32(ratio):
     # Pairs one sigma apart, out to the edge of the extent.
-    sigma = 1.0 / ratio
     model = 2 * cloud(200) - 1
-    data = model + sigma * torch.nn.functional.normalize(cloud(200, seed=3) - 0.5, dim=-1)
-    single, exact = (
-        em.expectation(model.to(t), data.to(t), torch.tensor(sigma, dtype=t)).inlier_posterior
-        for t in (torch.float32, D)
+    inputs = (
+        model,
+        model + torch.nn.functional.normalize(cloud(200, seed=3) - 0.5, dim=-1) / ratio,
+        torch.tensor(1 / ratio),
     )
+    single, exact = (em.expectation(*(v.to(t) for v in inputs)).inlier_posterior for t in (torch.float32, D))
     # At 1e5 the points themselves are rounded by a hundredth of sigma in float32.
     assert (single.double() - exact).abs().max() < (4e-3 if ratio < 1e4 else 2e-2) * exact.max()
 
@@ -164,26 +161,20 @@ def test_the_dense_posterior_is_differentiable():
 
 
 def test_the_outlier_constant_is_eq_18():
-    volume = torch.tensor(1.0, dtype=D)
     sigma = torch.tensor([1e-9, 0.05, 10.0], dtype=D)
-    limit, middle, floor = em.outlier_constant(100, sigma, volume)
-    assert float(limit) == pytest.approx(3.7599424)
-    share = 100 * 4 / 3 * math.pi * 0.05**3
-    assert float(middle) == pytest.approx(3 * math.sqrt(math.pi / 2) * (1 - share))
-    assert float(floor) == pytest.approx(0.05 * 3 * math.sqrt(math.pi / 2))
+    middle = 3 * math.sqrt(math.pi / 2) * (1 - 100 * 4 / 3 * math.pi * 0.05**3)
+    expected = [3.7599424, middle, 0.05 * 3 * math.sqrt(math.pi / 2)]
+    assert em.outlier_constant(100, sigma, torch.tensor(1.0, dtype=D)).tolist() == pytest.approx(expected)
     assert math.isclose(em.OUTLIER_CONSTANT, 3.7599424, rel_tol=1e-7)
 
 
 def test_the_working_volume_is_the_grown_box():
     model = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], dtype=D)
     data = torch.tensor([[0.0, 2.0, 0.5], [9.0, 9.0, 9.0]], dtype=D)
-    sigma = torch.tensor(0.1, dtype=D)
-    mask = torch.tensor([True, False])
-    assert float(em.working_volume(model, data, sigma, mask)) == pytest.approx(1.6 * 2.6 * 1.6)
-    assert float(em.working_volume(model, data, sigma)) == pytest.approx(9.6**3)
-    nothing = em.working_volume(model, data, sigma, torch.zeros(2, dtype=torch.bool))
-    assert float(nothing) == pytest.approx(1.6**3)
-    both = em.working_volume(torch.stack([model, 2 * model]), data, sigma, mask)
+    sigma, first = torch.tensor(0.1, dtype=D), torch.tensor([True, False])
+    for mask, expected in ((first, 1.6 * 2.6 * 1.6), (None, 9.6**3), (first & ~first, 1.6**3)):
+        assert float(em.working_volume(model, data, sigma, mask)) == pytest.approx(expected)
+    both = em.working_volume(torch.stack([model, 2 * model]), data, sigma, first)
     assert both.tolist() == pytest.approx([1.6 * 2.6 * 1.6, 2.6**3])
 
 
