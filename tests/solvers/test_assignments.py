@@ -5,19 +5,16 @@ from itertools import permutations, product
 import pytest
 import torch
 
+from tests.geometry.draws import D, rand, seeded
 from torchreg.solvers.assignment import assign
 from torchreg.solvers.cover import best_covers
 
 
-def random(*size, seed=0):
-    return torch.rand(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 @pytest.mark.parametrize(("rows", "columns"), [(4, 4), (3, 5), (1, 1)])
 def test_no_assignment_is_cheaper(rows, columns):
-    costs = random(rows, columns, seed=rows)
+    costs = rand(rows, columns, seed=rows)
     found = assign(costs)
-    best = min(sum(float(costs[r, c]) for r, c in enumerate(way)) for way in permutations(range(columns), rows))
+    best = min(sum(float(costs[r, c]) for r, c in enumerate(order)) for order in permutations(range(columns), rows))
     assert float(costs[torch.arange(rows), found].sum()) == pytest.approx(best)
     assert len(set(found.tolist())) == rows
 
@@ -32,31 +29,23 @@ def test_rows_stay_alone_where_columns_are_few_or_dear():
 
 
 def test_permuting_rows_and_columns_permutes_the_answer():
-    costs, rows, columns = random(5, 6), torch.tensor([3, 1, 4, 0, 2]), torch.tensor([5, 2, 0, 1, 4, 3])
-    found, moved = assign(costs, 0.4), assign(costs[rows][:, columns], 0.4)
-    there = torch.where(moved >= 0, columns[moved], -1)
-    assert torch.equal(there, found[rows])
+    costs, rows, columns = rand(5, 6), torch.tensor([3, 1, 4, 0, 2]), torch.tensor([5, 2, 0, 1, 4, 3])
+    moved = assign(costs[rows][:, columns], 0.4)
+    assert torch.equal(torch.where(moved >= 0, columns[moved], -1), assign(costs, 0.4)[rows])
 
 
 def problem(seed, rows=(4, 5, 3), columns=12, batch=2):
-    generator = torch.Generator().manual_seed(seed)
-    tables = [torch.rand(batch, count, columns, generator=generator, dtype=torch.float64) for count in rows]
-    costs = [torch.rand(batch, count, generator=generator, dtype=torch.float64) for count in rows]
-    return torch.rand(batch, columns, generator=generator, dtype=torch.float64), tables, costs
+    tables = [rand(batch, count, columns, seed=seed + k) for k, count in enumerate(rows)]
+    return rand(batch, columns, seed=seed), tables, [rand(batch, count, seed=seed + 9) for count in rows]
 
 
 def all_totals(uncovered, tables, costs, row):
-    """Return every choice with its cost, from the definition."""
+    """Every choice with its cost, from the definition."""
     found = {}
     for choice in product(*[range(table.shape[1]) for table in tables]):
-        covered = [
-            min(
-                [float(uncovered[row, column])]
-                + [float(t[row, k, column]) for t, k in zip(tables, choice, strict=True)]
-            )
-            for column in range(uncovered.shape[1])
-        ]
-        found[choice] = sum(covered) + sum(float(c[row, k]) for c, k in zip(costs, choice, strict=True))
+        chosen = [table[row, k] for table, k in zip(tables, choice, strict=True)]
+        covered = torch.stack([uncovered[row], *chosen]).amin(0).sum()
+        found[choice] = float(covered + sum(c[row, k] for c, k in zip(costs, choice, strict=True)))
     return found
 
 
@@ -68,7 +57,7 @@ def test_a_wide_beam_finds_the_best_choices_in_order(seed):
         expected = all_totals(uncovered, tables, costs, row)
         ranked = sorted(expected, key=expected.get)[:6]
         assert [tuple(choice) for choice in index[row].tolist()] == ranked
-        torch.testing.assert_close(total[row], torch.tensor([expected[c] for c in ranked], dtype=torch.float64))
+        torch.testing.assert_close(total[row], torch.tensor([expected[c] for c in ranked], dtype=D))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -99,9 +88,10 @@ def test_two_rows_that_must_change_together_are_found():
 def test_batches_equal_single_problems_and_columns_may_be_permuted():
     uncovered, tables, costs = problem(7, batch=3)
     index, total = best_covers(uncovered, tables, costs)
-    order = torch.randperm(uncovered.shape[1], generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(uncovered.shape[1], generator=seeded())
     for row in range(3):
-        alone = best_covers(uncovered[row : row + 1][:, order], [t[row : row + 1][..., order] for t in tables],
-                            [c[row : row + 1] for c in costs])  # fmt: skip
+        one = slice(row, row + 1)
+        permuted = (uncovered[one][:, order], [t[one][..., order] for t in tables], [c[one] for c in costs])
+        alone = best_covers(*permuted)
         torch.testing.assert_close(alone[1][0], total[row])
         assert alone[0][0].tolist() == index[row].tolist()

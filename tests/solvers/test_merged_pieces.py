@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from tests.geometry.draws import rand, seeded
 from torchreg.solvers.rigid_groups import merge_alike
 
 ALL = torch.ones(4, 4, dtype=torch.bool)
@@ -41,11 +42,8 @@ def test_what_was_joined_moves_as_its_larger_piece():
     assert joined(*row(0.0, 0.09, 0.18, 9.0, counts=(1.0, 4.0, 1.0, 1.0))) == {(0, 1, 2), (3,)}
 
 
-def test_pieces_without_points_stay_alone():
+def test_the_worst_frame_counts_and_pieces_without_points_stay_alone():
     assert joined(*row(0.0, 0.0, 0.0, 9.0, counts=(2.0, 0.0, 1.0, 1.0))) == {(0, 2), (1,), (3,)}
-
-
-def test_the_worst_frame_counts():
     still, counts = row(0.0, 0.0, 0.0, 0.0)
     for frames in ((still, row(0.0, 0.0, 3.0, 3.0)[0]), (row(0.0, 0.0, 3.0, 3.0)[0], still)):
         assert joined(torch.stack(frames), counts) == {(0, 1), (2, 3)}
@@ -53,10 +51,7 @@ def test_the_worst_frame_counts():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_numbers_of_pieces_do_not_matter(seed):
-    generator = torch.Generator().manual_seed(seed)
-    places, order = torch.rand(4, generator=generator), torch.randperm(4, generator=generator)
-    apart, counts = row(*places.tolist(), counts=(3.0, 1.0, 2.0, 5.0))
-    plain, other = (
-        merge_alike(apart[which][:, which].unsqueeze(0), counts[which], ALL, 0.3) for which in (torch.arange(4), order)
-    )
-    assert groups(plain) == {tuple(sorted(order[list(part)].tolist())) for part in groups(other)}
+    order = torch.randperm(4, generator=seeded(seed))
+    apart, counts = row(*rand(4, seed=seed).tolist(), counts=(3.0, 1.0, 2.0, 5.0))
+    plain, other = (joined(apart[which][:, which], counts[which], tolerance=0.3) for which in (torch.arange(4), order))
+    assert plain == {tuple(sorted(order[list(part)].tolist())) for part in other}

@@ -178,6 +178,7 @@ def test_the_working_volume_is_the_grown_box():
     assert both.tolist() == pytest.approx([1.6 * 2.6 * 1.6, 2.6**3])
 
 
+@pytest.mark.slow
 def test_no_table_of_all_pairs_is_held():
     code = """
 import resource, torch

@@ -5,18 +5,15 @@ from itertools import combinations
 import pytest
 import torch
 
+from tests.geometry.draws import randn
 from torchreg.solvers.tracks import TrackGraph
 
 
 def random_graph(seed):
-    """Return a graph of two detections in each of three frames, all pairs of frames linked."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(*size):
-        return torch.randn(*size, generator=generator, dtype=torch.float64)
-
+    """Two detections in each of three frames, all pairs of frames linked."""
     links = [(a, b) for a in range(6) for b in range(6) if a // 2 < b // 2]
-    return TrackGraph(torch.tensor(links), 2 * draw(len(links)), draw(6) + 0.5, draw(6) - 1, draw(6) - 1)
+    real, starts, stops = randn(3, 6, seed=seed) + torch.tensor([[0.5], [-1.0], [-1.0]])
+    return TrackGraph(torch.tensor(links), 2 * randn(len(links), seed=seed + 9), real, starts, stops)
 
 
 def score_of(graph, used):
