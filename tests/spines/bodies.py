@@ -6,41 +6,38 @@ from collections.abc import Sequence
 import torch
 
 import torchreg as tr
+from tests.geometry.draws import randn as random
+from tests.geometry.draws import seeded
 from torchreg.geometry.isosurface import isosurface
+from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.skeleton import build_skeleton
 
 STAR = "(()()()()())"  # the topology of a starfish
 
 
-def random(*size, seed=0):
-    return torch.randn(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def shuffled(count, seed):
-    return torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    return torch.randperm(count, generator=seeded(seed))
 
 
 def line(start, end, count=60):
-    """Return points (count, 3) from one point to another."""
+    """Points (count, 3) from one point to another."""
     start, end = torch.tensor(start).double(), torch.tensor(end).double()
     return start + torch.linspace(0, 1, count).double()[:, None] * (end - start)
 
 
 def circle(radius=1.0, count=200, turn=(0.0, 1.0), z=0.0):
-    """Return points (count, 3) of an arc in the plane z, from and to a share of a full turn."""
+    """Points (count, 3) of an arc in the plane z, from and to a share of a full turn."""
     angle = 2 * torch.pi * torch.linspace(*turn, count).double()
     return torch.stack((radius * angle.cos(), radius * angle.sin(), z + 0 * angle), dim=1)
 
 
 def tube(axis, radius, spacing=0.07):
-    """Return the surface of the union of balls around points (n, 3), of one radius or n of them."""
+    """The surface of the union of balls around points (n, 3), of one radius or n of them."""
     radius = torch.as_tensor(radius, dtype=torch.float64).expand(len(axis))
     margin = float(radius.max()) + 2 * spacing
-    return isosurface(
-        lambda points: (torch.cdist(points, axis) - radius).amin(1),
-        axis.amin(0) - margin, axis.amax(0) + margin, spacing,
-    )  # fmt: skip
+    lower, upper = axis.amin(0) - margin, axis.amax(0) + margin
+    return isosurface(lambda points: (torch.cdist(points, axis) - radius).amin(1), lower, upper, spacing)
 
 
 def with_mixed_winding(mesh):
@@ -51,17 +48,19 @@ def with_mixed_winding(mesh):
 
 
 def similarity(seed, scale=1.0):
-    """Return a motion with scale, (4, 4)."""
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3] = scale * so3_exp(3 * random(3, seed=seed))
-    matrix[:3, 3] = 10 * scale * random(3, seed=seed + 100)
-    return matrix
+    """A motion with scale, (4, 4)."""
+    return rigid_matrix(scale * so3_exp(3 * random(3, seed=seed)), 10 * scale * random(3, seed=seed + 100))
+
+
+def turn_matrix(*entries):
+    """A rotation by the matrix exponential of three entries above the diagonal."""
+    upper = torch.zeros(3, 3, dtype=torch.float64)
+    upper[[0, 0, 1], [1, 2, 2]] = torch.tensor(entries, dtype=torch.float64)
+    return torch.linalg.matrix_exp(upper - upper.mT)
 
 
 def moved(points, matrix):
-    """Return points (..., 3) moved by a matrix (4, 4), in the dtype of the points."""
-    matrix = matrix.to(points)
-    return points @ matrix[:3, :3].mT + matrix[:3, 3]
+    return transform_points(matrix.to(points), points)
 
 
 def arms_skeleton(sequence, frame, arms=range(5), extra=None, notes=()):
@@ -78,7 +77,7 @@ def arms_skeleton(sequence, frame, arms=range(5), extra=None, notes=()):
 
 
 def star_skeleton(tips):
-    """Return a skeleton of straight limbs from the origin to tips (K, 3)."""
+    """Straight limbs from the origin to tips (K, 3)."""
     nodes = torch.cat((tips, torch.zeros(1, 3).to(tips)))
     edges = torch.tensor([[k, len(tips)] for k in range(len(tips))])
     return tr.Skeleton(nodes, edges, torch.full((len(nodes),), 0.1).to(tips))

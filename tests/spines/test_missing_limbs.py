@@ -6,8 +6,9 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.spines.bodies import MeshesOnRequest, arms_skeleton, moved, random, similarity
+from tests.spines.bodies import MeshesOnRequest, arms_skeleton, moved, random, similarity, turn_matrix
 from torchreg.datasets.creatures import STARFISH, creature_sequence
+from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.skeleton import build_skeleton
 from torchreg.spines.labeled_tree import LimbGraph
 from torchreg.spines.limbs import limb_transfer, local_icp, observed_limbs
@@ -28,16 +29,6 @@ def observed(creature, frame, missing=()):
     return observed_limbs.observe_limbs(arms_skeleton(creature, frame, arms), labels, GRAPH, SAMPLES)
 
 
-def test_a_tree_that_has_the_graph_gives_all_limbs(creature):
-    limbs = observed(creature, 1)
-    assert bool(limbs.observed.all() & limbs.node_observed.all())
-    torch.testing.assert_close(limbs.curves[:, 0], creature.curves[1, :, -1])
-    torch.testing.assert_close(limbs.curves[:, -1], creature.curves[1, :, 0])
-    torch.testing.assert_close(limbs.nodes[5], creature.curves[1, 0, 0])
-    steps = (limbs.curves[:, 1:] - limbs.curves[:, :-1]).norm(dim=-1)
-    torch.testing.assert_close(steps, steps.mean(1, keepdim=True).expand_as(steps), rtol=0.02, atol=0)
-
-
 def test_limbs_that_touch_each_other_are_not_observed(creature):
     curves = creature.curves[1]
     middle, knot, ends = curves[0, 0], 0.5 * (curves[0, 36] + curves[1, 36]), curves[:, -1]
@@ -53,8 +44,6 @@ def test_a_junction_needs_three_limbs(creature):
     limbs = observed(creature, 0, missing=(1, 2, 4))
     assert limbs.node_observed.tolist() == [True, False, False, True, False, False]
     assert not bool(limbs.observed.any())
-    nothing = observed_limbs.observe_limbs(arms_skeleton(creature, 0, (0, 3)), [-1] * 5, GRAPH, SAMPLES)
-    assert not bool(nothing.observed.any() | nothing.node_observed.any())
 
 
 def test_limbs_of_odd_length_are_rejected_with_their_tips(creature):
@@ -70,27 +59,15 @@ def test_limbs_of_odd_length_are_rejected_with_their_tips(creature):
 
 @pytest.fixture(scope="module")
 def gaps(creature):
-    """Limbs of which the frames 1 to 4, and 6 to the end, lack arm 3; and the surfaces."""
-    lacking = (1, 2, 3, 4, 6, 7)
-    frames = [observed(creature, frame, missing=(3,) if frame in lacking else ()) for frame in range(FRAMES)]
+    """Limbs of which the frames 1 to 4, and 6 to the end, lack arm 3; the surfaces; and the limbs transferred."""
+    frames = [observed(creature, frame, missing=(3,) if frame not in (0, 5) else ()) for frame in range(FRAMES)]
     meshes = list(creature.meshes)
     meshes[1] = tr.TriangleMesh(meshes[1].vertices, meshes[1].faces.flip(1))  # the winding does not matter
-    return frames, meshes
+    return frames, meshes, limb_transfer.transfer_missing_limbs(frames, GRAPH, meshes, workers=1)
 
 
-@pytest.fixture(scope="module")
-def transferred(gaps):
-    frames, meshes = gaps
-    return limb_transfer.transfer_missing_limbs(frames, GRAPH, meshes, workers=1)
-
-
-def same(first, second):
-    pairs = zip(first, second, strict=True)
-    return all(torch.equal(a.curves, b.curves) and torch.equal(a.nodes, b.nodes) for a, b in pairs)
-
-
-def test_missing_limbs_are_transferred_and_lie_on_the_true_axes(creature, gaps, transferred):
-    for number, (before, after) in enumerate(zip(gaps[0], transferred, strict=True)):
+def test_missing_limbs_are_transferred_and_lie_on_the_true_axes(creature, gaps):
+    for number, (before, _, after) in enumerate(zip(*gaps, strict=True)):
         assert (after is before) == bool(before.observed.all())
         assert float(torch.cdist(after.curves[3], creature.curves[number, 3]).amin(-1).max()) < 0.12
         assert float((after.curves[3, 0] - creature.curves[number, 3, -1]).norm()) < 0.15
@@ -98,19 +75,14 @@ def test_missing_limbs_are_transferred_and_lie_on_the_true_axes(creature, gaps, 
         assert torch.equal(after.curves[:3], before.curves[:3])
 
 
-def test_processes_give_what_one_gives_from_few_surfaces(gaps, transferred):
-    frames, meshes = gaps
-    on_request = MeshesOnRequest(meshes)
-    assert same(limb_transfer.transfer_missing_limbs(frames, GRAPH, on_request, workers=1), transferred)
-    assert on_request.most <= 4  # two of this step, two of the last
-    assert same(limb_transfer.transfer_missing_limbs(frames, GRAPH, meshes, workers=2), transferred)
+def test_transfers_go_on_where_they_ended_in_any_process_and_from_few_surfaces(gaps, tmp_path, monkeypatch):
+    frames, meshes, transferred = gaps
 
-
-def test_a_transfer_that_was_interrupted_goes_on_where_it_ended(gaps, transferred, tmp_path, monkeypatch):
-    frames, meshes = gaps
-
-    def transfer(surfaces, workers=1):
-        return limb_transfer.transfer_missing_limbs(frames, GRAPH, surfaces, workers=workers, progress=tmp_path)
+    def check(surfaces, **options):
+        found = limb_transfer.transfer_missing_limbs(frames, GRAPH, surfaces, **options)
+        for first, second in zip(found, transferred, strict=True):
+            assert torch.equal(first.curves, second.curves)
+            assert torch.equal(first.nodes, second.nodes)
 
     def files():
         return {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.safetensors")}
@@ -118,24 +90,26 @@ def test_a_transfer_that_was_interrupted_goes_on_where_it_ended(gaps, transferre
     def fails(**_):
         raise AssertionError("computed again")
 
+    on_request = MeshesOnRequest(meshes)
+    check(on_request, workers=1)
+    assert on_request.most <= 4  # two of this step, two of the last
     with pytest.raises(KeyboardInterrupt):
-        transfer(MeshesOnRequest(meshes, unreadable=[3]))
+        check(MeshesOnRequest(meshes, unreadable=[3]), workers=1, progress=tmp_path)
     before = files()
     assert before
-    assert same(transfer(meshes, workers=2), transferred)
+    check(meshes, workers=2, progress=tmp_path)
     assert before.items() < files().items()
     monkeypatch.setattr(limb_transfer, "transfer_nodes", fails)
-    assert same(transfer(meshes), transferred)
+    check(meshes, workers=1, progress=tmp_path)
     with pytest.raises(AssertionError, match="computed again"):
-        transfer([*meshes[:7], tr.TriangleMesh(1.01 * meshes[7].vertices, meshes[7].faces)])
+        check([*meshes[:7], tr.TriangleMesh(1.01 * meshes[7].vertices, meshes[7].faces)], workers=1, progress=tmp_path)
 
 
 def test_frames_are_transported_with_a_body_that_rotates(creature):
     curves = torch.stack([observed(creature, frame).curves for frame in range(5)])
     frames = limb_transfer.transported_frames(curves, 2)
-    assert frames.shape == (*curves.shape[:3], 3, 3)
-    torch.testing.assert_close(frames @ frames.mT, torch.eye(3).double().expand_as(frames))
-    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.2], [0.7, 0, 0.1], [-0.2, -0.1, 0]]).double())
+    torch.testing.assert_close(frames @ frames.mT, torch.eye(3).double().expand(*curves.shape[:3], 3, 3))
+    turn = turn_matrix(-0.7, 0.2, 0.1)
     rigid = limb_transfer.transported_frames(torch.stack((curves[0], curves[0] @ turn.mT)), 0)
     torch.testing.assert_close(rigid[1], turn @ rigid[0], atol=1e-6, rtol=0)
 
@@ -183,9 +157,7 @@ def fitted(axis, source, target, widths, num_rounds=4, known=None, radius=0.12):
 
 def test_nodes_move_rigidly_with_the_surface():
     axis, source, normals = bent_tube(0.6)
-    matrix = torch.eye(4).double()
-    matrix[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, 0.1, 0.15], [-0.1, 0, -0.1], [-0.15, 0.1, 0]]).double())
-    matrix[:3, 3] = torch.tensor([0.05, -0.04, 0.08])
+    matrix = rigid_matrix(turn_matrix(0.1, 0.15, -0.1), torch.tensor([0.05, -0.04, 0.08]).double())
     target = moved(source, matrix), normals @ matrix[:3, :3].mT
     found = fitted(axis, (source, normals), target, [1.0, 0.3], num_rounds=20)
     torch.testing.assert_close(found, moved(axis, matrix), atol=0.04, rtol=0)
