@@ -4,16 +4,16 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.spines.bodies import STAR, nearest_arms
+from tests.geometry.draws import seeded
+from tests.spines.bodies import STAR, nearest_arms, random, shuffled
 from torchreg.geometry.mesh import sample_surface
 from torchreg.spines.frames import frame_surfaces
 
 
 def noisy_points(mesh, count, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    points = sample_surface(mesh, count, generator)[0]
+    points = sample_surface(mesh, count, seeded(seed))[0]
     diagonal = float((points.amax(0) - points.amin(0)).norm())
-    return points + 0.002 * diagonal * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+    return points + 0.002 * diagonal * random(*points.shape, seed=seed).to(points)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +54,9 @@ def test_processes_give_the_surfaces_that_one_gives_and_kept_ones_are_not_made_a
 
 
 def test_order_and_repetition_of_points_change_nothing(clouds):
-    order = torch.randperm(len(clouds[0]), generator=torch.Generator().manual_seed(1))
     plain = tr.skeletonize(clouds[0])
-    other = tr.skeletonize(tr.RangeScan(torch.cat((clouds[0], clouds[0][:50]))[order]))
+    twice = torch.cat((clouds[0], clouds[0][:50]))
+    other = tr.skeletonize(tr.RangeScan(twice[shuffled(len(twice), 1)]))
     assert not plain.notes
     assert other.topology == plain.topology
     torch.testing.assert_close(other.nodes, plain.nodes, atol=1e-5, rtol=0)
@@ -64,9 +64,7 @@ def test_order_and_repetition_of_points_change_nothing(clouds):
 
 def test_one_side_of_a_body_and_joined_gaps_are_noted(starfish, clouds):
     points, curve = clouds[0], starfish.curves[0, 1]
-    front = points[points[:, 2] > points[:, 2].median()]
-    plane = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
-    for side in (front, plane):
+    for side in (points[points[:, 2] > points[:, 2].median()], random(500, 3) * torch.tensor([1.0, 1.0, 0.0])):
         assert any("do not enclose a body" in note for note in tr.skeletonize(side).notes)
     cut = tr.skeletonize(points[(points - curve[len(curve) // 2]).norm(dim=-1) > 0.2])
     assert any("joined across gaps" in note for note in cut.notes)

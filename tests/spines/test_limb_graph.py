@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.geometry.draws import seeded
 from tests.spines.bodies import random, shuffled, star_skeleton
 from torchreg.spines import labeled_tree
 from torchreg.spines.labeled_tree import LimbGraph, place_junctions, skeleton_splits
@@ -15,8 +16,7 @@ def splits(*rows):
 
 def random_tree(count, seed):
     """Nodes that each hang on one before it."""
-    generator = torch.Generator().manual_seed(seed)
-    edges = [[int(torch.randint(0, node, (1,), generator=generator)), node] for node in range(1, count)]
+    edges = [[int(torch.randint(0, node, (1,), generator=seeded(100 * seed + node))), node] for node in range(1, count)]
     return tr.Skeleton(random(count, 3, seed=seed), torch.tensor(edges), torch.ones(count))
 
 
@@ -50,10 +50,9 @@ def test_the_graph_of_a_tree_has_its_splits_and_its_topology(seed):
 def test_lengths_along_the_tree_are_sums_of_steps():
     tree = random_tree(12, 3)
     found = labeled_tree.path_lengths(tree, torch.arange(12))
-    for start in range(12):
-        for end in range(12):
-            path = tree.nodes[tree.path(start, end)]
-            assert float(found[start, end]) == pytest.approx(float((path[1:] - path[:-1]).norm(dim=-1).sum()), abs=1e-9)
+    for start, end in torch.cartesian_prod(torch.arange(12), torch.arange(12)).tolist():
+        steps = tree.nodes[tree.path(start, end)].diff(dim=0).norm(dim=-1)
+        assert float(found[start, end]) == pytest.approx(float(steps.sum()), abs=1e-9)
 
 
 def test_junctions_lie_on_those_of_the_tree_and_labels_without_tips_do_no_harm():

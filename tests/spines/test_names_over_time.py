@@ -1,13 +1,13 @@
 """Names of tips over a whole sequence: relations on the surface, the most probable chain, the mirror of a body."""
 
-from itertools import product
+from itertools import combinations, permutations, product
 
 import pytest
 import torch
 from scipy.stats import multivariate_t
 
 import torchreg as tr
-from tests.spines.bodies import moved, random, similarity
+from tests.spines.bodies import moved, random, shuffled, similarity
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.spines.names import body_mirror, name_chain, name_model, student_t
@@ -49,11 +49,13 @@ def test_densities_are_those_of_scipy():
     spread, points = random(4, 4), random(6, 5, seed=1)
     covariance, tails = spread @ spread.mT, student_t.TAILS
     density = student_t.GroupedDensity([student_t.FeatureGroup(torch.arange(4), 4)], [covariance])
-    wanted = multivariate_t(shape=covariance.numpy(), df=tails.dof).logpdf(points[:, :4].numpy())
-    torch.testing.assert_close(density(points)[:, 0], torch.from_numpy(wanted))
-    wanted = multivariate_t(shape=0.09 * torch.eye(3).double().numpy(), df=tails.displacement_dof)
-    found = student_t.t_log_density(points[:, :3].square().sum(-1), torch.tensor(0.3).double(), 3)
-    torch.testing.assert_close(found, torch.from_numpy(wanted.logpdf(points[:, :3].numpy())))
+    displacements = student_t.t_log_density(points[:, :3].square().sum(-1), torch.tensor(0.3).double(), 3)
+    for found, shape, dof in (
+        (density(points)[:, 0], covariance, tails.dof),
+        (displacements, 0.09 * torch.eye(3).double(), tails.displacement_dof),
+    ):
+        wanted = multivariate_t(shape=shape.numpy(), df=dof).logpdf(points[:, : len(shape)].numpy())
+        torch.testing.assert_close(found, torch.from_numpy(wanted))
 
 
 def test_the_best_chain_and_the_chances_of_its_states_are_those_of_all_chains():
@@ -110,21 +112,18 @@ def walking(body, num_frames, *, lift):
     Two feet pass each other from frame to frame, or are lifted in turn, which brings them near the other tips.
     """
     wanted, roots, ends = (torch.tensor(body[name]).double() for name in ("distances", "roots", "ends"))
-    count = len(roots)
+    count, frames, orders = len(roots), [], []
     usual = torch.tensor([-2.0, -2, -2.5, -2.5, -1.5]).double()[:count]
-    frames, orders = [], []
     for number in range(num_frames):
-        phase = torch.tensor(torch.pi * number / 4)
-        feet = (
-            [phase.sin().clamp_min(0), (-phase.sin()).clamp_min(0)] if lift else [(-1.0) ** number, -((-1) ** number)]
-        )
-        up = torch.tensor([*feet, *[0.0] * (count - 2)]).double()
-        shift = torch.stack((0 * up, 0.3 * up, 0.6 * up), 1) if lift else torch.stack((0 * up, 0 * up, 0.2 * up), 1)
+        phase, up = torch.tensor(torch.pi * number / 4), torch.zeros(count).double()
+        side = phase.sin() if lift else torch.tensor((-1.0) ** number)
+        up[:2] = torch.stack((side, -side)).clamp_min(0 if lift else -1)
+        shift = torch.stack((0 * up, 0.3 * up * lift, (0.6 if lift else 0.2) * up), 1)
         tips = roots + ends + shift
         curves = tips[:, None] + torch.linspace(0, 1, 8).double()[:, None] * (roots - tips)[:, None]
-        noise = 0.003 * random(count, count, seed=number) - (0.15 * up if lift else 0)
-        limbs = torch.stack((wanted.mean(1) - (0.3 * up if lift else 0), usual), 1) + 0.01 * random(count, 2)
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(number))
+        noise = 0.003 * random(count, count, seed=number) - 0.15 * lift * up
+        limbs = torch.stack((wanted.mean(1) - 0.3 * lift * up, usual), 1) + 0.01 * random(count, 2)
+        order = shuffled(count, number)
         distances = (wanted + noise + noise.mT).fill_diagonal_(0)[order][:, order]
         frames.append(TipObservations(curves[order], distances, torch.zeros(3 * [count]).double(), limbs[order]))
         orders.append(order)
@@ -152,19 +151,14 @@ def test_exchanges_are_all_permutations_that_undo_themselves(count, number):
 
 def test_a_mirror_gives_the_features_of_the_mirrored_frame_under_exchanged_names():
     distances, volumes = random(5, 5).abs(), random(5, 5, 5, seed=1)
-    for first, second in ((0, 1), (1, 2), (0, 1)):
-        volumes = volumes - volumes.transpose(first, second)
-    cycled = sum(volumes.permute(*order) for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)))
-    cycled = cycled - cycled.transpose(0, 1)
+    signs = {order: (-1) ** (sum(a > b for a, b in combinations(order, 2))) for order in permutations(range(3))}
+    odd = sum(sign * volumes.permute(*order) for order, sign in signs.items())
     frame, mirrored = (
-        TipObservations(random(5, 8, 3), distances + distances.mT, sign * cycled, random(5, 3)) for sign in (1, -1)
+        TipObservations(random(5, 8, 3), distances + distances.mT, sign * odd, random(5, 3)) for sign in (1, -1)
     )
-    kinds, names, usual = (
-        TipFeatures(5, 3, with_volumes=True),
-        torch.tensor([[1, 0, 3, 2, 4]]),
-        torch.zeros(10).double(),
-    )
+    kinds, names = TipFeatures(5, 3, with_volumes=True), torch.tensor([[1, 0, 3, 2, 4]])
     columns, signs = body_mirror._images(kinds, names)
+    usual = torch.zeros(10).double()
     features = kinds(frame, torch.arange(5)[None], usual)[0]
     torch.testing.assert_close(signs[0] * features[columns[0]], kinds(mirrored, names, usual)[0])
 

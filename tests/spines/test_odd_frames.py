@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.geometry.draws import sheet_faces
 from tests.spines.bodies import MeshesOnRequest
 from torchreg.geometry.mesh import concatenate
 
@@ -21,17 +22,14 @@ def two_bodies(mesh):
 def test_what_the_creature_stands_on_is_left_out(meshes, spine, cloud):
     steps = torch.linspace(-2.5, 2.5, 60)
     table = torch.cartesian_prod(steps, steps, torch.zeros(1))
-    corner = torch.arange(3600).reshape(60, 60)[:-1, :-1].reshape(-1, 1)
-    faces = torch.cat((corner + torch.tensor([0, 60, 1]), corner + torch.tensor([1, 60, 61])))
 
     def standing(mesh):
         below = mesh.vertices.new_tensor([0.0, 0.0, float(mesh.vertices[:, 2].min()) - 0.01])
-        both = concatenate([mesh, tr.TriangleMesh(table + below, faces)])
+        both = concatenate([mesh, tr.TriangleMesh(table + below, sheet_faces(60, 60))])
         return both.vertices if cloud else both
 
-    frames = [standing(mesh) for mesh in meshes]
     with pytest.warns(tr.errors.FileWarning, match=r"14\d\d\d points in 4 of 4 frames lie on the plane") as warned:
-        found = tr.extract_spine(frames, workers=1)
+        found = tr.extract_spine([standing(mesh) for mesh in meshes], workers=1)
     assert len(warned) == 1
     assert found.num_tips == 5
     assert float(torch.cdist(found.tips, spine.tips).amin(2).max()) < 0.2

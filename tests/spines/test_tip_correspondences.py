@@ -54,6 +54,14 @@ def test_added_tips_are_left_out_and_missing_ones_are_named(count):
     assert cost == pytest.approx(0.5 / count, abs=1e-3)
 
 
+def test_references_count_by_their_weights():
+    first, second, order = random(5, 3), random(5, 3, seed=1), shuffled(5, 1)
+    near, _ = match([TipReference(first), TipReference(second, weight=1e-6)], first)
+    assert torch.equal(near, torch.arange(5))
+    far, _ = match([TipReference(first, weight=1e-6), TipReference(second[order])], second)
+    assert torch.equal(far, order)
+
+
 def test_a_symmetric_creature_has_not_turned_in_a_moment():
     order, bent = shuffled(5, 4), star(5) + 0.1 * random(5, 3, seed=3)
     index, _ = match([TipReference(star(5), rotation_weight=0.1)], bent[order])
@@ -66,14 +74,6 @@ def test_lengths_tell_limbs_apart_that_positions_do_not():
     order = torch.tensor([3, 0, 1, 2])  # the long limb is curled up, and all have turned by a quarter
     index, _ = match([TipReference(star(4), lengths)], star(4), lengths[order][:, order])
     assert torch.equal(order[index], torch.arange(4))
-
-
-def test_references_count_by_their_weights():
-    first, second, order = random(5, 3), random(5, 3, seed=1), shuffled(5, 1)
-    near, _ = match([TipReference(first), TipReference(second, weight=1e-6)], first)
-    assert torch.equal(near, torch.arange(5))
-    far, _ = match([TipReference(first, weight=1e-6), TipReference(second[order])], second)
-    assert torch.equal(far, order)
 
 
 def test_no_tips_at_all_and_tips_in_one_place_are_answered():
@@ -98,15 +98,13 @@ def test_every_arm_keeps_its_name_also_backwards_in_time(creatures, count):
     orders = [shuffled(count, frame).tolist() for frame in range(FRAMES)]
     skeletons = [arms_skeleton(creatures[count], frame, orders[frame]) for frame in range(FRAMES)]
     arms, reference = tracked_arms(skeletons, orders)
-    assert all(row == arms[0] for row in arms)
-    assert sorted(arms[0]) == list(range(count))
     assert reference == (FRAMES - 1) // 2
-    backward, _ = tracked_arms(skeletons[::-1], orders[::-1])
-    assert all(row == backward[0] for row in backward)
-    assert sorted(backward[0]) == list(range(count))
+    for rows in (arms, tracked_arms(skeletons[::-1], orders[::-1])[0]):
+        assert all(row == rows[0] for row in rows)
+        assert sorted(rows[0]) == list(range(count))
 
 
-def test_a_lost_arm_is_missing_and_a_new_one_has_no_name(creatures):
+def test_a_lost_arm_is_missing_a_new_one_has_no_name_and_frames_in_which_arms_touch_are_no_references(creatures):
     sequence = creatures[5]
     orders = [shuffled(5, frame).tolist() for frame in range(FRAMES)]
     orders[2] = [arm for arm in orders[2] if arm != 3]
@@ -116,14 +114,10 @@ def test_a_lost_arm_is_missing_and_a_new_one_has_no_name(creatures):
     arms, reference = tracked_arms(skeletons, orders)
     full = arms[reference]
     assert sorted(full) == list(range(5))
-    assert [row for frame, row in enumerate(arms) if frame != 2] == [full] * 7
-    assert arms[2] == [arm if arm != 3 else -1 for arm in full]
-
-
-def test_frames_in_which_arms_touch_are_no_references(creatures):
+    assert arms == [[arm if frame != 2 or arm != 3 else -1 for arm in full] for frame in range(FRAMES)]
     notes = [("1 loop(s) cut",) if 1 <= frame <= 5 else () for frame in range(FRAMES)]
-    skeletons = [arms_skeleton(creatures[5], frame, notes=notes[frame]) for frame in range(FRAMES)]
-    assert tip_tracking.track_tips(skeletons).reference == 6
+    touching = [arms_skeleton(sequence, frame, notes=notes[frame]) for frame in range(FRAMES)]
+    assert tip_tracking.track_tips(touching).reference == 6
 
 
 def test_k_is_the_most_frequent_number_or_what_was_asked_for(creatures):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.geometry.draws import D, randn
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.blend import turn_about
 from torchreg.registration.bones.joint_moments import JointMoments
@@ -28,9 +29,8 @@ def energy(problem, model, transforms, index=()):
     turn = difference[:, :3, :3]
     gap = (turn @ moments.center.unsqueeze(-1)).squeeze(-1) + difference[:, :3, 3]
     joints = gap.square().sum(-1) + ((turn @ moments.spread) * turn).sum((-1, -2))
-    total = (
-        total + problem.joint_weight * ((1.0 if problem.pair_weights is None else problem.pair_weights) * joints).sum()
-    )
+    joints = joints if problem.pair_weights is None else problem.pair_weights * joints
+    total = total + problem.joint_weight * joints.sum()
     if problem.anchors is None:
         return total
     shares = problem.binding.weights / problem.binding.weights.sum(0)
@@ -38,29 +38,40 @@ def energy(problem, model, transforms, index=()):
     return total + (problem.anchor_weights * (shares.mT * off.square().sum(-1)).sum(-1)).sum()
 
 
-def turned(problem, motion):
-    """Return the problem with its targets and anchors moved."""
-    pairs = problem.correspondences
+def moved(problem, motion, size=1.0):
+    """The problem with its targets and anchors moved, and all of it scaled."""
+    pairs, moments, bodies = problem.correspondences, problem.moments, problem.bodies
     normals = None if pairs.normals is None else pairs.normals @ motion[:3, :3].mT
-    pairs = replace(pairs, targets=transform_points(motion, pairs.targets), normals=normals)
-    anchors = None if problem.anchors is None else motion @ problem.anchors
-    return replace(problem, correspondences=pairs, anchors=anchors)
+    return replace(
+        problem,
+        points=size * problem.points,
+        correspondences=replace(pairs, targets=size * transform_points(motion, pairs.targets), normals=normals),
+        moments=JointMoments(moments.pairs, size**3 * moments.mass, size * moments.center, size**2 * moments.spread),
+        bodies=replace(bodies, center=size * bodies.center, spread=size**2 * bodies.spread),
+        anchors=None if problem.anchors is None else placed(motion @ problem.anchors, size),
+    )
+
+
+def placed(motions, size):
+    return torch.cat((motions[..., :3], motions[..., 3:] * torch.tensor([[size]] * 3 + [[1.0]])), dim=-1)
+
+
+def at_rest(count, dtype=D):
+    return torch.eye(4, dtype=dtype).repeat(count, 1, 1)
 
 
 @pytest.mark.parametrize(("blend", "share"), [("linear", 0), ("linear", 0.3), ("linear", 1), ("dual_quaternion", 0.2)])
 def test_the_linearization_is_that_of_the_energy(bones, blend, share):
     problem, model = bones.noisy_problem(blend, float(share))
-    transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
+    transforms, zero = se3_exp(0.3 * randn(2, bones.COUNT, 6, seed=5)), torch.zeros(6 * bones.COUNT, dtype=D)
     found = problem.linearize(transforms)
     torch.testing.assert_close(found.hessian, found.hessian.mT)
     for k in range(2):
         centers = problem.centers(transforms[k])
 
         def cost(twists, k=k, centers=centers):
-            moved = turn_about(transforms[k], twists.reshape(bones.COUNT, 6), centers)
-            return 0.5 * energy(problem, model, moved, k)
+            return 0.5 * energy(problem, model, turn_about(transforms[k], twists.reshape(bones.COUNT, 6), centers), k)
 
-        zero = torch.zeros(6 * bones.COUNT, dtype=torch.float64)
         torch.testing.assert_close(found.cost[k], cost(zero).detach())
         torch.testing.assert_close(found.gradient[k], torch.func.grad(cost)(zero), atol=1e-9, rtol=1e-7)
     torch.testing.assert_close(problem.energy(transforms), 2 * found.cost)
@@ -72,60 +83,45 @@ def test_without_residuals_the_hessian_is_exact(bones, share):
     points, normals = bones.limb(60)
     model, transforms = bones.model_of(points, resolution=8), bones.bent()
     with torch.no_grad():
-        moved, moments, weights = model(points, transforms), model.joint_moments(), model.weights_at(points)
+        goal, moments, weights = model(points, transforms), model.joint_moments(), model.weights_at(points)
     together = transforms[:1].expand(bones.COUNT, 4, 4)
-    dropped = torch.zeros(60, dtype=torch.float64)
-    for problem, at in (
-        (bones.problem_of(points, weights, moved, normals, point_to_point=share), transforms),
-        (bones.problem_of(points, weights, moved, normals, dropped, moments=moments), together),
+    for problem, start in (
+        (bones.problem_of(points, weights, goal, normals, point_to_point=share), transforms),
+        (bones.problem_of(points, weights, goal, normals, torch.zeros(60, dtype=D), moments=moments), together),
     ):
-        centers = problem.centers(at)
+        centers = problem.centers(start)
 
-        def cost(twists, problem=problem, at=at, centers=centers):
-            return 0.5 * energy(problem, model, turn_about(at, twists.reshape(bones.COUNT, 6), centers))
+        def cost(twists, problem=problem, start=start, centers=centers):
+            return 0.5 * energy(problem, model, turn_about(start, twists.reshape(bones.COUNT, 6), centers))
 
-        expected = torch.func.hessian(cost)(torch.zeros(6 * bones.COUNT, dtype=torch.float64))
-        torch.testing.assert_close(problem.linearize(at).hessian, expected, atol=1e-10, rtol=1e-8)
+        expected = torch.func.hessian(cost)(torch.zeros(6 * bones.COUNT, dtype=D))
+        torch.testing.assert_close(problem.linearize(start).hessian, expected, atol=1e-10, rtol=1e-8)
 
 
 def test_joints_may_be_elsewhere_and_weights_differ_between_problems(bones):
     problem, _ = bones.noisy_problem()
-    transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
-    joints = problem.moments.center + 0.1 * bones.draw(len(problem.moments.pairs), 3, seed=6)
-    found = problem.linearize(transforms, joints)
-    expected = replace(problem, moments=replace(problem.moments, center=joints)).linearize(transforms)
-    pairs, anchors = problem.pair_weights, problem.anchor_weights
-    scaled = {"pair_weights": 2 * pairs, "anchor_weights": 3 * anchors}
-    stacked = {name: torch.stack([getattr(problem, name), value]) for name, value in scaled.items()}
-    both, first = (replace(problem, **change).linearize(transforms) for change in (stacked, {}))
-    second = replace(problem, **scaled).linearize(transforms)
+    transforms = se3_exp(0.3 * randn(2, bones.COUNT, 6, seed=5))
+    joints = problem.moments.center + 0.1 * randn(len(problem.moments.pairs), 3, seed=6)
+    elsewhere = replace(problem, moments=replace(problem.moments, center=joints)).linearize(transforms)
+    more = {"pair_weights": 2 * problem.pair_weights, "anchor_weights": 3 * problem.anchor_weights}
+    stacked = {name: torch.stack([getattr(problem, name), value]) for name, value in more.items()}
+    first, second, both = (replace(problem, **change).linearize(transforms) for change in ({}, more, stacked))
     for name in LINEARIZED:
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+        torch.testing.assert_close(getattr(problem.linearize(transforms, joints), name), getattr(elsewhere, name))
         torch.testing.assert_close(getattr(both, name)[0], getattr(first, name)[0])
         torch.testing.assert_close(getattr(both, name)[1], getattr(second, name)[1])
 
 
-def test_bindings_list_every_pair_once(bones):
-    weights = torch.tensor([[0.5, 0.0, 0.5], [0.0, 1.0, 0.0], [0.2, 0.3, 0.5], [1.0, 1e-6, 0.0]])
-    found = bones.problem_of(torch.eye(4, 3), weights, torch.eye(4, 3)).binding
-    assert found.point.tolist() == [0, 0, 1, 2, 2, 2, 3]
-    assert found.bone.tolist() == [0, 2, 1, 0, 1, 2, 0]
-    pairs = [(0, 0), (0, 1), (1, 1), (2, 2), (3, 3), (3, 4), (3, 5), (4, 4), (4, 5), (5, 5), (6, 6)]
-    assert list(zip(found.first.tolist(), found.second.tolist(), strict=True)) == pairs
-    assert found.block.tolist()[:3] == [0, 2, 8]
-    assert found.num_bones == 3
-
-
 def test_bodies_are_weighted_moments_and_inertia_is_the_mean_squared_shift(bones):
-    points, weights = bones.draw(20, 3), bones.draw(20, 2, seed=1).abs()
+    points, weights = randn(20, 3), randn(20, 2, seed=1).abs()
     problem = bones.problem_of(points, torch.nn.functional.pad(weights, (0, 1)), points)
+    start, twist = se3_exp(0.3 * randn(3, 6, seed=5)), 1e-4 * randn(6, seed=6)
+    goal = turn_about(start, twist.expand(3, 6), problem.centers(start))
     for bone, shares in enumerate([*(weights / weights.sum(0)).mT, torch.full((20,), 1 / 20).double()]):
         torch.testing.assert_close(problem.bodies.center[bone], shares @ points)
         expected = torch.cov(points.mT, correction=0, aweights=shares)
         torch.testing.assert_close(problem.bodies.spread[bone], expected)
-        start, twist = se3_exp(0.3 * bones.draw(3, 6, seed=5)), 1e-4 * bones.draw(6, seed=6)
-        moved = turn_about(start, twist.expand(3, 6), problem.centers(start))
-        shift = transform_points(moved[bone], points) - transform_points(start[bone], points)
+        shift = transform_points(goal[bone], points) - transform_points(start[bone], points)
         found = twist @ problem.inertia(start)[bone] @ twist
         torch.testing.assert_close(found, (shares * shift.square().sum(-1)).sum(), rtol=1e-3, atol=0)
 
@@ -137,24 +133,23 @@ def test_the_motions_behind_matches_are_found(bones, blend):
     with torch.no_grad():
         targets, weights = model(points, truth), model.weights_at(points)
         problem = bones.problem_of(points, weights, targets, point_to_point=1.0, blend=blend)
-    fit = fit_bones(problem, torch.eye(4, dtype=torch.float64).repeat(bones.COUNT, 1, 1), max_steps=30, rtol=1e-4)
+    fit = fit_bones(problem, at_rest(bones.COUNT), max_steps=30, rtol=1e-4)
     assert bool(fit.converged)
     # Shares below 1e-4 are left out of the fit.
     torch.testing.assert_close(fit.transforms, truth, atol=1e-4, rtol=0)
     rotation = fit.transforms[:, :3, :3]
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64).expand(bones.COUNT, 3, 3))
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=D).expand(bones.COUNT, 3, 3))
 
 
 def test_joints_place_a_bone_without_matches(bones):
     points, normals = bones.limb()
-    model, truth = bones.model_of(points), bones.bent()
+    model, truth, start = bones.model_of(points), bones.bent(), at_rest(bones.COUNT)
     with torch.no_grad():
         targets, weights, moments = model(points, truth), model.weights_at(points), model.joint_moments()
     kept = (points[:, 0] < 1.8).double()
-    start = torch.eye(4, dtype=torch.float64).repeat(bones.COUNT, 1, 1)
     problem = bones.problem_of(points, weights, targets, normals, kept, 1.0, moments=moments, joint_weight=0.01)
     fit = fit_bones(problem, start, max_steps=50, rtol=1e-4)
-    elbow = torch.tensor([[2.0, 0.1, 0.0]], dtype=torch.float64)
+    elbow = torch.tensor([[2.0, 0.1, 0.0]], dtype=D)
     ends = [transform_points(motion, elbow) for motion in (fit.transforms[2], truth[1])]
     torch.testing.assert_close(*ends, atol=0.02, rtol=0)
     alone = fit_bones(replace(problem, joint_weight=0.0), start, max_steps=50)
@@ -163,19 +158,17 @@ def test_joints_place_a_bone_without_matches(bones):
 
 def test_fixed_bones_stay_and_anchors_hold(bones):
     problem, _ = bones.noisy_problem()
-    start = se3_exp(0.1 * bones.draw(2, bones.COUNT, 6, seed=6))
-    fixed = torch.tensor([True, False, True])
+    start, fixed = se3_exp(0.1 * randn(2, bones.COUNT, 6, seed=6)), torch.tensor([True, False, True])
     fit = fit_bones(problem, start, fixed=fixed)
     torch.testing.assert_close(fit.transforms[:, fixed], start[:, fixed])
     assert bool((fit.energy < problem.energy(start)).all())
-    strong = replace(problem, joint_weight=0.0, anchor_weights=1e6)
-    held = fit_bones(strong, start, max_steps=30).transforms
+    held = fit_bones(replace(problem, joint_weight=0.0, anchor_weights=1e6), start, max_steps=30).transforms
     torch.testing.assert_close(held, problem.anchors.expand(2, bones.COUNT, 4, 4), atol=1e-4, rtol=0)
 
 
 def test_batches_equal_loops_and_energy_never_rises(bones):
     problem, _ = bones.noisy_problem(batch=(2, 3))
-    start = se3_exp(0.5 * bones.draw(2, 3, bones.COUNT, 6, seed=6))
+    start = se3_exp(0.5 * randn(2, 3, bones.COUNT, 6, seed=6))
     fit = fit_bones(problem, start, max_steps=4, rtol=0.0)
     assert fit.transforms.shape == (2, 3, bones.COUNT, 4, 4)
     assert fit.num_steps == 4
@@ -189,51 +182,33 @@ def test_batches_equal_loops_and_energy_never_rises(bones):
     torch.testing.assert_close(shared[1, 2], fit_bones(single, start[0, 0], max_steps=1).transforms)
 
 
-def test_turning_and_scaling_everything_changes_nothing_else(bones):
+@pytest.mark.parametrize("size", [1.0, 1e3])
+def test_turning_and_scaling_everything_changes_nothing_else(bones, size):
     problem, _ = bones.noisy_problem(batch=())
-    start = se3_exp(0.3 * bones.draw(bones.COUNT, 6, seed=6))
-    motion = se3_exp(torch.tensor([1.0, 2, 3, 1, -1, 0.5], dtype=torch.float64))
-    found = fit_bones(problem, start).transforms
-    torch.testing.assert_close(fit_bones(turned(problem, motion), motion @ start).transforms, motion @ found)
-    size, pairs, moments = 1e3, problem.correspondences, problem.moments
-    wide = replace(
-        problem,
-        points=size * problem.points,
-        correspondences=replace(pairs, targets=size * pairs.targets),
-        moments=JointMoments(moments.pairs, size**3 * moments.mass, size * moments.center, size**2 * moments.spread),
-        bodies=replace(problem.bodies, center=size * problem.bodies.center, spread=size**2 * problem.bodies.spread),
-        anchors=scaled(problem.anchors, size),
-    )
-    torch.testing.assert_close(fit_bones(wide, scaled(start, size)).transforms, scaled(found, size))
+    start = se3_exp(0.3 * randn(bones.COUNT, 6, seed=6))
+    motion = se3_exp(torch.tensor([1.0, 2, 3, 1, -1, 0.5], dtype=D))
+    found = fit_bones(moved(problem, motion, size), placed(motion @ start, size)).transforms
+    torch.testing.assert_close(found, placed(motion @ fit_bones(problem, start).transforms, size))
 
 
-def scaled(motions, size):
-    motions = motions.clone()
-    motions[..., :3, 3] *= size
-    return motions
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_flat_matches_do_not_slide(bones, dtype):
-    plane = torch.cat([bones.draw(100, 2), torch.zeros(100, 1)], dim=-1).to(dtype)
+    plane = torch.cat([randn(100, 2), torch.zeros(100, 1)], dim=-1).to(dtype)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=dtype).expand(100, 3)
     weights = torch.nn.functional.one_hot((plane[:, 0] > 0).long(), 2).to(dtype)
     tilted = plane + torch.tensor([0.3, 0.2, 0.1], dtype=dtype) + 0.05 * plane[:, :1] * up
-    start = torch.eye(4, dtype=dtype).repeat(2, 1, 1)
-    fit = fit_bones(bones.problem_of(plane, weights, tilted, up), start, max_steps=20, rtol=0.0)
+    fit = fit_bones(bones.problem_of(plane, weights, tilted, up), at_rest(2, dtype), max_steps=20, rtol=0.0)
     assert float(fit.energy) < 1e-8
     assert float(fit.transforms[:, :2, 3].abs().max()) < 0.02
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_dropped_matches_and_idle_bones_do_no_harm(bones, dtype):
     points, normals = (value.to(dtype) for value in bones.limb())
-    weights = torch.zeros(len(points), 4, dtype=dtype)
-    weights[:, 1] = 1
-    kept = (points[:, 0] > 0.3).to(dtype)
+    weights = torch.nn.functional.one_hot(torch.ones(len(points)).long(), 4).to(dtype)
+    kept, start = (points[:, 0] > 0.3).to(dtype), at_rest(4, dtype)
     targets = points + torch.tensor([0.0, 0.1, 0], dtype=dtype)
     targets, normals = (torch.where(kept.unsqueeze(-1) > 0, value, math.nan) for value in (targets, normals))
-    start = torch.eye(4, dtype=dtype).repeat(4, 1, 1)
     fit = fit_bones(bones.problem_of(points, weights, targets, normals, kept, 0.2), start, max_steps=10)
     assert fit.transforms.dtype == dtype
     assert float(fit.energy) < 1e-9
@@ -250,36 +225,24 @@ FRAMES = 4
 @pytest.fixture(scope="module")
 def frames(bones):
     """Motions (F, 3, 4, 4) of the limb, bent about changing axes, its problem with joints at the surface, and rest."""
-    vectors = 0.5 * bones.draw(FRAMES, 2, 3, seed=7)
-    motions = [torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)]
+    vectors, motions = 0.5 * randn(FRAMES, 2, 3, seed=7), [at_rest(FRAMES)]
     for joint, pivot in enumerate(PIVOTS):
         motions.append(motions[-1] @ torch.stack([bones.turned_about(pivot, each) for each in vectors[:, joint]]))
-    truth = se3_exp(0.2 * bones.draw(FRAMES, 1, 6, seed=8)) @ torch.stack(motions, dim=1)
+    truth = se3_exp(0.2 * randn(FRAMES, 1, 6, seed=8)) @ torch.stack(motions, dim=1)
     points, normals = bones.limb()
     model = bones.model_of(points)
     with torch.no_grad():
         targets, weights = model(points, truth), model.weights_at(points)
-    directions = torch.nn.functional.normalize(
-        torch.einsum("nb,fbij,nj->fni", weights, truth[..., :3, :3], normals), dim=-1
-    )
+    directions = torch.einsum("nb,fbij,nj->fni", weights, truth[..., :3, :3], normals)
+    directions = torch.nn.functional.normalize(directions, dim=-1)
     pairs = torch.tensor([[0, 1], [1, 2]])
     moments = JointMoments(pairs, torch.ones(2).double(), SURFACE, torch.zeros(2, 3, 3).double())
 
-    def problem(noise=0.0, share=1.0, joint_weight=1.0):
-        noisy = targets + noise * bones.draw(*targets.shape, seed=9)
-        return bones.problem_of(
-            points, weights, noisy, directions, None, share, moments=moments, joint_weight=joint_weight
-        )
+    def problem(noise=0.0, share=1.0):
+        noisy, terms = targets + noise * randn(*targets.shape, seed=9), {"moments": moments, "joint_weight": 1.0}
+        return bones.problem_of(points, weights, noisy, directions, None, share, **terms)
 
-    return truth, problem, torch.eye(4, dtype=torch.float64).repeat(FRAMES, bones.COUNT, 1, 1)
-
-
-def test_joints_behind_motions_are_found(frames):
-    truth, problem, rest = frames
-    fit = fit_bones_and_joints(problem(), rest, SURFACE, regularization=1e-9, max_steps=40, rtol=1e-9)
-    torch.testing.assert_close(fit.centers, PIVOTS, atol=1e-3, rtol=0)
-    torch.testing.assert_close(fit.transforms, truth, atol=1e-3, rtol=0)
-    assert bool((fit.energy < 1e-6).all())
+    return truth, problem, torch.eye(4, dtype=D).repeat(FRAMES, bones.COUNT, 1, 1)
 
 
 def test_nothing_near_has_less_energy(frames, bones):
@@ -301,29 +264,25 @@ def test_nothing_near_has_less_energy(frames, bones):
     torch.testing.assert_close(fit.energy.sum() + away, total(zero, fit.centers).detach())
 
 
-def test_a_motion_of_everything_changes_no_joint(frames, bones):
+def test_a_motion_of_everything_changes_no_joint(frames):
     _, problem, rest = frames
-    problem, motion = problem(0.02, 0.2), se3_exp(bones.draw(6, seed=10))
+    problem, motion = problem(0.02, 0.2), se3_exp(randn(6, seed=10))
     alone = fit_bones_and_joints(problem, rest, SURFACE)
-    moved = fit_bones_and_joints(turned(problem, motion), motion @ rest, SURFACE)
-    torch.testing.assert_close(moved.centers, alone.centers)
-    torch.testing.assert_close(moved.transforms, motion @ alone.transforms)
+    turned = fit_bones_and_joints(moved(problem, motion), motion @ rest, SURFACE)
+    torch.testing.assert_close(turned.centers, alone.centers)
+    torch.testing.assert_close(turned.transforms, motion @ alone.transforms)
 
 
-def test_energy_falls_from_any_start_and_few_steps_are_enough(frames, bones):
-    problem = frames[1](0.02, 0.2)
-    first = se3_exp(0.3 * bones.draw(FRAMES, bones.COUNT, 6, seed=11))
-    energies = [fit_bones_and_joints(problem, first, PIVOTS, max_steps=steps, rtol=0.0).energy for steps in (1, 3, 9)]
-    assert energies[0].sum() > energies[1].sum() > energies[2].sum()
-    done = fit_bones_and_joints(problem, first, PIVOTS, max_steps=100)
-    torch.testing.assert_close(done.energy.sum(), energies[2].sum(), rtol=0.01, atol=0)
-
-
-def test_bones_without_matches_follow_their_joints(frames):
-    _, problem, rest = frames
+@pytest.mark.parametrize("reach", [9.0, 1.8])
+def test_joints_behind_motions_are_found_and_bones_without_matches_follow_them(frames, reach):
+    truth, problem, rest = frames
     problem = problem()
-    kept = (problem.points[:, 0] < 1.8).double().expand(FRAMES, -1)
+    kept = (problem.points[:, 0] < reach).double().expand(FRAMES, -1)
     problem = replace(problem, correspondences=replace(problem.correspondences, weights=kept))
-    fit = fit_bones_and_joints(problem, rest, PIVOTS, max_steps=40, rtol=1e-9)
+    fit = fit_bones_and_joints(problem, rest, SURFACE, regularization=1e-9, max_steps=40, rtol=1e-9)
     ends = [transform_points(fit.transforms[:, bone], fit.centers[1:]) for bone in (1, 2)]
     torch.testing.assert_close(*ends, atol=1e-3, rtol=0)
+    torch.testing.assert_close(fit.transforms[:, :2], truth[:, :2], atol=1e-3, rtol=0)
+    if reach == 9.0:
+        torch.testing.assert_close(fit.centers, PIVOTS, atol=1e-3, rtol=0)
+        torch.testing.assert_close(fit.transforms, truth, atol=1e-3, rtol=0)

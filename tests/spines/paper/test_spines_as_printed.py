@@ -2,14 +2,15 @@
 
 import itertools
 import random
-from collections import deque
 
+import networkx
 import numpy as np
 import pytest
 import torch
 
 import torchreg as tr
-from tests.spines.bodies import STAR, star_skeleton
+from tests.geometry.draws import randn
+from tests.spines.bodies import STAR, shuffled, star_skeleton
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.spines.labeled_tree import junctions_from_splits
 from torchreg.spines.paper.metanodes import metanode_junctions
@@ -28,34 +29,66 @@ def dumbbell():
     return MeshEdges(tr.TriangleMesh(lobed, ball.faces)), lobed, lobed[:, 2].abs() + 0.1 * lobed[:, 0].abs()
 
 
-def parts_of_bins(edges, bins):
-    """The connected parts of the bins by breadth-first search."""
-    near = {vertex: [] for vertex in range(len(bins))}
-    for a, b in edges.tolist():
-        near[a].append(b)
-        near[b].append(a)
-    part, count = [-1] * len(bins), 0
-    for start in range(len(bins)):
-        if part[start] >= 0:
-            continue
-        waiting, part[start] = deque([start]), count
-        while waiting:
-            vertex = waiting.popleft()
-            for other in near[vertex]:
-                if part[other] < 0 and bins[other] == bins[vertex]:
-                    part[other] = count
-                    waiting.append(other)
-        count += 1
-    return part
+def random_tree(tips, generator):
+    """A tree with labeled tips; inner nodes are negative."""
+    near = networkx.Graph([(-1, tip) for tip in range(3)])
+    for tip in range(3, tips):
+        inner = [node for node in near if node < 0]
+        if generator.random() < 0.4:
+            joint = generator.choice(inner)
+        else:
+            a, b = generator.choice(list(near.edges))
+            joint = -len(inner) - 1
+            near.remove_edge(a, b)
+            near.add_edges_from([(a, joint), (joint, b)])
+        near.add_edge(joint, tip)
+    return near
+
+
+def beyond(near, start, first):
+    """The tips behind the limb from a node to its neighbor."""
+    cut = near.copy()
+    cut.remove_edge(start, first)
+    return frozenset(node for node in networkx.node_connected_component(cut, first) if node >= 0)
+
+
+def as_tip_tree(near, root):
+    limbs = [beyond(near, *ends) for edge in near.edges for ends in (edge, edge[::-1])]
+    return TipTree(root, None, tuple(Branch(tips, torch.arange(3)) for tips in limbs if root not in tips))
+
+
+def merged_by_walking(trees):
+    """Figure 3B: branch nodes next to a tip are one supernode, those that share a node one metanode."""
+    joined = networkx.Graph()
+    joined.add_nodes_from((tree, node) for tree, near in enumerate(trees) for node in near if node < 0)
+    for tip in range(sum(node >= 0 for node in trees[0])):
+        nexts = [(tree, next(iter(near[tip]))) for tree, near in enumerate(trees)]
+        joined.add_edges_from(itertools.pairwise(nexts))
+    changed = True
+    while changed:
+        before, parts = joined.number_of_edges(), list(networkx.connected_components(joined))
+        for tree, near in enumerate(trees):
+            for part in parts:
+                for a, b in itertools.combinations([node for owner, node in part if owner == tree], 2):
+                    path = [(tree, node) for node in networkx.shortest_path(near, a, b)]
+                    joined.add_edges_from(itertools.pairwise(path))
+        changed = joined.number_of_edges() > before
+    near, part = trees[0], {node: k for k, nodes in enumerate(networkx.connected_components(joined)) for node in nodes}
+    limbs = [ends for edge in near.edges if max(edge) < 0 for ends in (edge, edge[::-1])]
+    limbs = [(a, b) for a, b in limbs if part[0, a] != part[0, b]]
+    return {side for a, b in limbs if 0 not in (side := beyond(near, a, b))}
 
 
 def test_bands_are_the_connected_parts_of_bins(dumbbell):
     mesh, _, values = dumbbell
     found = vertex_level_sets(mesh, values, 0.25)
     bins = (values / 0.25).floor().long().tolist()
-    expected = parts_of_bins(mesh.edges, bins)
-    pairs = set(zip(found.vertex_bands.tolist(), expected, strict=True))
-    assert len(pairs) == found.num_bands == max(expected) + 1
+    graph = networkx.empty_graph(len(bins))
+    graph.add_edges_from((a, b) for a, b in mesh.edges.tolist() if bins[a] == bins[b])
+    parts = list(networkx.connected_components(graph))
+    expected = {vertex: number for number, part in enumerate(parts) for vertex in part}
+    pairs = {(band, expected[vertex]) for vertex, band in enumerate(found.vertex_bands.tolist())}
+    assert len(pairs) == found.num_bands == len(parts)
 
 
 def test_nodes_are_means_of_vertices_and_cost_by_equation_4(dumbbell):
@@ -76,83 +109,6 @@ def test_bins_are_never_narrower_than_most_edges(dumbbell):
     assert found.num_bands < len(vertices) / 4
 
 
-def random_tree(tips, generator):
-    """A tree with labeled tips as neighbors by node; inner nodes are negative."""
-    near = {-1: list(range(3)), 0: [-1], 1: [-1], 2: [-1]}
-    for tip in range(3, tips):
-        inner = [node for node in near if node < 0]
-        if generator.random() < 0.4:
-            joint = generator.choice(inner)
-        else:
-            a = generator.choice(list(near))
-            b = generator.choice(near[a])
-            joint = -len(inner) - 1
-            near[joint] = [a, b]
-            near[a][near[a].index(b)] = joint
-            near[b][near[b].index(a)] = joint
-        near[joint].append(tip)
-        near[tip] = [joint]
-    return near
-
-
-def beyond(near, start, first):
-    """The tips behind the limb from a node to its neighbor."""
-    seen, waiting = {start, first}, [first]
-    while waiting:
-        for node in near[waiting.pop()]:
-            if node not in seen:
-                seen.add(node)
-                waiting.append(node)
-    return frozenset(node for node in seen - {start} if node >= 0)
-
-
-def as_tip_tree(near, root):
-    branches = [
-        Branch(beyond(near, a, b), torch.arange(3)) for a in near for b in near[a] if root not in beyond(near, a, b)
-    ]
-    return TipTree(root, None, tuple(branches))
-
-
-def merged_by_walking(trees):
-    """Figure 3B: branch nodes next to a tip are one supernode, those that share a node one metanode."""
-    parent = {(tree, node): (tree, node) for tree, near in enumerate(trees) for node in near if node < 0}
-
-    def top(node):
-        while parent[node] != node:
-            node = parent[node]
-        return node
-
-    def path(near, start, end):
-        before, waiting = {start: None}, deque([start])
-        while waiting:
-            node = waiting.popleft()
-            for other in near[node]:
-                if other not in before:
-                    before[other] = node
-                    waiting.append(other)
-        row = [end]
-        while before[row[-1]] is not None:
-            row.append(before[row[-1]])
-        return row
-
-    for tip in range(sum(node >= 0 for node in trees[0])):
-        for tree, near in enumerate(trees):
-            parent[top((tree, near[tip][0]))] = top((0, trees[0][tip][0]))
-    changed = True
-    while changed:
-        changed = False
-        for tree, near in enumerate(trees):
-            for a, b in itertools.combinations([node for node in near if node < 0], 2):
-                if top((tree, a)) == top((tree, b)):
-                    for node in path(near, a, b):
-                        if top((tree, node)) != top((tree, a)):
-                            parent[top((tree, node))] = top((tree, a))
-                            changed = True
-    near = trees[0]
-    limbs = [(a, b) for a in near for b in near[a] if a < 0 and b < 0 and top((0, a)) != top((0, b))]
-    return {side for a, b in limbs if 0 not in (side := beyond(near, a, b))}
-
-
 @pytest.mark.parametrize("tips", [4, 5])
 def test_metanodes_are_those_of_walking_inward_from_the_tips(tips):
     """With up to five tips every branch node is next to one, so that one walk reaches all."""
@@ -169,8 +125,7 @@ def test_metanodes_are_those_of_walking_inward_from_the_tips(tips):
 
 def test_two_different_pairs_of_three_way_junctions_are_one_of_four_limbs():
     """The paper's figure 3B."""
-    red = {-1: [0, 1, -2], -2: [-1, 2, 3], 0: [-1], 1: [-1], 2: [-2], 3: [-2]}
-    green = {-1: [0, 2, -2], -2: [-1, 1, 3], 0: [-1], 2: [-1], 1: [-2], 3: [-2]}
+    red, green = (networkx.Graph([(-1, 0), (-1, a), (-1, -2), (-2, b), (-2, 3)]) for a, b in ((1, 2), (2, 1)))
     trees = [as_tip_tree(near, root) for root, near in enumerate((red, red, green, green))]
     assert len(metanode_junctions(trees)) == 1
     assert len(metanode_junctions([as_tip_tree(red, root) for root in range(4)])) == 2
@@ -184,29 +139,22 @@ def kabsch_error(a, b):
 
 
 def test_tips_are_mapped_by_the_least_rigid_error():
-    generator = torch.Generator().manual_seed(0)
-    base = torch.randn(5, 3, generator=generator)
-    order = [torch.randperm(5, generator=generator) for _ in range(6)]
-    frames = [base[row] + 0.05 * torch.randn(5, 3, generator=generator) for row in order]
+    base = randn(5, 3, dtype=torch.float32)
+    frames = [base[shuffled(5, k)] + 0.05 * randn(5, 3, seed=k, dtype=torch.float32) for k in range(6)]
     labels, reference = track_tips_rigidly([star_skeleton(tips) for tips in frames])
     assert reference == 2
-    known = frames[reference].double().numpy()
+    known, orders = frames[reference].double().numpy(), list(itertools.permutations(range(5)))
     for tips, row in zip(frames, labels, strict=True):
-        errors = {
-            trial: kabsch_error(known, tips.double().numpy()[list(trial)]) for trial in itertools.permutations(range(5))
-        }
+        errors = {order: kabsch_error(known, tips.double().numpy()[list(order)]) for order in orders}
         assert tuple(row.tolist()) == min(errors, key=errors.get)
 
 
-def test_a_superfluous_tip_gets_no_name_and_a_missing_one_is_told():
-    base = torch.randn(4, 3, generator=torch.Generator().manual_seed(1))
+def test_a_superfluous_tip_gets_no_name_and_a_missing_one_is_reported():
+    base = randn(4, 3, seed=1, dtype=torch.float32)
     more = torch.cat((base, torch.tensor([[0.1, 0.1, 0.2]])))
     labels, _ = track_tips_rigidly([star_skeleton(tips) for tips in (base, base, more, base, base[:3])])
     assert labels[2].tolist() == [0, 1, 2, 3]
     assert labels[4].tolist() == [0, 1, 2, -1]
-
-
-def test_a_number_of_tips_that_no_frame_has_is_refused():
     with pytest.raises(tr.errors.InputError, match="num_tips must be what a frame shows, 4 at most, got 7"):
         track_tips_rigidly([star_skeleton(torch.eye(4, 3))], 7)
 
