@@ -5,15 +5,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
+from tests.geometry.draws import rand, randn, seeded
 from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
 
 def grid_and_weights(num_bones=4, resolution=6, sparse=True):
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(120, 3, generator=generator, dtype=torch.float64) * torch.tensor([2.0, 1.0, 0.5])
+    points = rand(120, 3) * torch.tensor([2.0, 1.0, 0.5])
     grid = SparseGrid.from_points(points, resolution)
-    weights = torch.rand(grid.num_corners, num_bones, generator=generator, dtype=torch.float64)
+    weights = rand(grid.num_corners, num_bones, seed=1)
     if sparse:
         far = torch.cdist(grid.corner_points(), points[:num_bones])
         weights = weights * (far < far.amin(-1, keepdim=True) + 0.4)
@@ -39,30 +39,24 @@ def matrices(moments):
 
 
 def quadrature(grid, weights, i, j, order=6):
-    """The integral of w_i w_j x~ x~^T by a Gauss rule of higher order, one cell and node at a time."""
+    """The integral of w_i w_j x~ x~^T by a Gauss rule of higher order, one node at a time."""
     nodes, gauss = np.polynomial.legendre.leggauss(order)
     total = torch.zeros(4, 4, dtype=torch.float64)
-    for cell in range(grid.num_cells):
-        corners = grid.cell_corners[cell]
-        for a, b, c in np.ndindex(order, order, order):
-            y = np.array([nodes[a], nodes[b], nodes[c]]) / 2 + 0.5
-            volume = gauss[a] * gauss[b] * gauss[c] / 8 * grid.spacing**3
-            side = np.stack([1 - y, y])
-            shape = np.array([side[n >> 2, 0] * side[n >> 1 & 1, 1] * side[n & 1, 2] for n in range(8)])
-            value = torch.from_numpy(shape) @ weights[corners]
-            x = grid.origin + grid.axes @ ((grid.cells[cell] + torch.from_numpy(y)) * grid.spacing)
-            x = torch.cat([x, x.new_ones(1)])
-            total += volume * value[i] * value[j] * torch.outer(x, x)
+    for step in np.ndindex(order, order, order):
+        y = nodes[list(step)] / 2 + 0.5
+        side = np.stack([1 - y, y])
+        shape = torch.tensor([side[n >> 2, 0] * side[n >> 1 & 1, 1] * side[n & 1, 2] for n in range(8)])
+        value = torch.einsum("c,ncb->nb", shape, weights[grid.cell_corners])
+        x = grid.origin + (grid.cells + torch.from_numpy(y)) @ grid.axes.mT * grid.spacing
+        x = torch.cat([x, torch.ones(len(x), 1)], dim=1)
+        volume = np.prod(gauss[list(step)]) / 8 * grid.spacing**3
+        total += volume * torch.einsum("n,na,nb->ab", value[:, i] * value[:, j], x, x)
     return total
 
 
 def test_moments_equal_quadrature_and_the_energy_is_their_trace():
     grid, weights = grid_and_weights(3, 3)
-    moments, transforms = (
-        moments_of(grid, weights),
-        se3_exp(torch.randn(3, 6, generator=torch.Generator().manual_seed(0))),
-    )
-    transforms, expected = transforms.double(), 0.0
+    moments, transforms, expected = moments_of(grid, weights), se3_exp(randn(3, 6)), 0.0
     assert moments.pairs.tolist() == [[0, 1], [0, 2], [1, 2]]
     for (i, j), matrix in zip(moments.pairs.tolist(), matrices(moments), strict=True):
         integral = quadrature(grid, weights, i, j)
@@ -74,18 +68,13 @@ def test_moments_equal_quadrature_and_the_energy_is_their_trace():
 
 def test_only_pairs_that_meet_are_returned_and_given_ones_in_their_order():
     grid, weights = grid_and_weights(6, 8)
-    moments = moments_of(grid, weights)
-    meets = torch.zeros(6, 6, dtype=torch.bool)
-    for corners in grid.cell_corners:
-        reach = weights[corners].amax(0) > 0
-        meets |= reach[:, None] & reach
-    assert moments.pairs.tolist() == meets.triu(1).nonzero().tolist()
-    order = torch.randperm(len(moments.pairs), generator=torch.Generator().manual_seed(0))
+    moments, reach = moments_of(grid, weights), (weights[grid.cell_corners].amax(1) > 0).double()
+    assert moments.pairs.tolist() == (reach.mT @ reach > 0).triu(1).nonzero().tolist()
+    order = torch.randperm(len(moments.pairs), generator=seeded())
     given = moments_of(grid, weights, pairs=moments.pairs[order])
     for name in ("pairs", "mass", "center", "spread"):
         torch.testing.assert_close(getattr(given, name), getattr(moments.select(order), name))
-    alone = torch.zeros_like(weights)
-    alone[:, 0] = 1
+    alone = torch.nn.functional.one_hot(torch.zeros(len(weights)).long(), 6).double()
     assert moments_of(grid, alone).pairs.shape == (0, 2)
     trace = torch.cat([alone[:, :1], torch.full_like(alone[:, :1], 1e-8)], dim=1)
     assert [len(moments_of(grid, trace, min_mass=least).pairs) for least in (1e-6, 1e-12)] == [0, 1]
@@ -112,13 +101,11 @@ def test_moments_move_with_the_grid():
 
 def test_energy_vanishes_when_all_bones_move_alike_and_grows_with_the_square():
     grid, weights = grid_and_weights(3, 4, sparse=False)
-    transforms = se3_exp(torch.randn(2, 3, 6, generator=torch.Generator().manual_seed(0)).double())
+    transforms, order = se3_exp(randn(2, 3, 6)), torch.tensor([2, 0, 1])
     assert float(joint_energy(grid, weights, transforms[0, :1].expand(3, 4, 4))) == 0
     expected = joint_energy(grid, weights, transforms)
     torch.testing.assert_close(expected[1], joint_energy(grid, weights, transforms[1]))
     wide = SparseGrid(grid.cells, grid.shape, 10 * grid.origin, grid.axes, 10 * grid.spacing)
-    scaled = transforms.clone()
-    scaled[..., :3, 3] *= 10
+    scaled = transforms * torch.tensor([[1.0, 1, 1, 10]] * 3 + [[1.0] * 4])
     torch.testing.assert_close(joint_energy(wide, weights, scaled), 100 * expected)
-    order = torch.tensor([2, 0, 1])
     torch.testing.assert_close(joint_energy(grid, weights[:, order], transforms[:, order]), expected)
