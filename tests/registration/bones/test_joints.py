@@ -4,35 +4,39 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.geometry.draws import rand, randn
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.bones.joint_moments import JointMoments
 from torchreg.registration.bones.joint_prior import joint_weights, with_stiffness
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
+BETA = 0.01
+
+
 REST = torch.eye(4, dtype=torch.float64)
 
 
 def joints_of(pairs, centers, transforms, **options):
-    """Return the joints of pairs that share weight about given centers."""
+    """The joints of pairs that share weight about given centers."""
     centers = torch.as_tensor(centers, dtype=torch.float64)
-    mass, spread = torch.ones(len(pairs)).double(), torch.zeros(len(pairs), 3, 3).double()
-    grid = SparseGrid.from_points(torch.rand(20, 3, generator=torch.Generator().manual_seed(0)).double(), 1)
+    grid = SparseGrid.from_points(rand(20, 3), 1)
     model = tr.GridLBS(grid, torch.ones(grid.num_corners, transforms.shape[-3], dtype=torch.float64))
-    return model.joints_of(JointMoments(torch.tensor(pairs), mass, centers, spread), transforms, **options)
+    return model.joints_of(moments(pairs, centers), transforms, **options)
 
 
-def test_a_hinge_is_found_and_its_axis_left_at_the_region(bones):
-    whole = se3_exp(torch.tensor([1.0, -2, 3, 0.4, 0.2, -1], dtype=torch.float64))
-    transforms = torch.stack([whole, whole @ bones.turned_about([1.0, 2.0, 0.0], [0, 0, 1.2])])
+def moments(pairs, centers, spread=0.0):
+    mass, spreads = torch.ones(len(pairs)).double(), torch.full((len(pairs), 3, 3), spread).double()
+    return JointMoments(torch.tensor(pairs), mass, centers, spreads)
+
+
+def test_hinges_and_balls_are_found(bones):
+    whole, turned = se3_exp(torch.tensor([1.0, -2, 3, 0.4, 0.2, -1], dtype=torch.float64)), bones.turned_about
+    transforms = torch.stack([whole, whole @ turned([1.0, 2.0, 0.0], [0, 0, 1.2])])
     joints = joints_of([[0, 1]], [[1.3, 1.8, 0.7]], transforms, regularization=1e-8)
     torch.testing.assert_close(joints.centers[0], torch.tensor([1.0, 2.0, 0.7], dtype=torch.float64))
     assert float(joints.gaps[0]) < 1e-6
-
-
-def test_several_poses_find_a_ball_joint(bones):
-    ball = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
-    vectors = ([0.5, 0, 0], [0, 0.5, 0.1], [0, 0, 0.4])
-    poses = torch.stack([torch.stack([REST, bones.turned_about(ball, vector)]) for vector in vectors])
+    ball, vectors = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64), ([0.5, 0, 0], [0, 0.5, 0.1], [0, 0, 0.4])
+    poses = torch.stack([torch.stack([REST, turned(ball, vector)]) for vector in vectors])
     joints = joints_of([[0, 1]], [[0.0, 0.0, 0.0]], poses, regularization=1e-9)
     torch.testing.assert_close(joints.centers[0], ball, atol=1e-6, rtol=0)
     assert joints.gaps.shape == (3, 1)
@@ -50,8 +54,8 @@ def test_bones_that_turn_alike_meet_at_the_region_and_regularization_is_a_square
         assert float(found[0]) == pytest.approx(0.5, abs=0.01)
 
 
-def test_joints_move_with_the_space_and_have_gradients(bones):
-    transforms = se3_exp(bones.draw(3, 6))
+def test_joints_move_with_the_space_and_have_gradients():
+    transforms = se3_exp(randn(3, 6))
     pairs, centers = [[0, 1], [1, 2]], torch.tensor([[0.1, 0.2, 0.3], [1.0, 0.0, -1.0]]).double()
     found = joints_of(pairs, centers, transforms).centers
     start = se3_exp(torch.tensor([0.3, 2, 1, 1, -0.5, 0.2], dtype=torch.float64))
@@ -61,17 +65,17 @@ def test_joints_move_with_the_space_and_have_gradients(bones):
 
 
 def blocks(*boxes):
-    """Return the model of boxes of cells, one bone each, from ((x, x), (y, y)), ends included, and one cell deep."""
-    cells, labels = [], []
-    for bone, ((left, right), (low, high)) in enumerate(boxes):
-        own = torch.cartesian_prod(torch.arange(left, right + 1), torch.arange(low, high + 1), torch.zeros(1).long())
-        cells.append(own)
-        labels += [bone] * len(own)
-    cells = torch.cat(cells)
+    """The model of boxes of cells, one bone each, from ((x, x), (y, y)), ends included, and one cell deep."""
+    owner = {
+        (x, y): bone
+        for bone, ((left, right), (low, high)) in enumerate(boxes)
+        for x in range(left, right + 1)
+        for y in range(low, high + 1)
+    }
+    cells = torch.tensor([(*cell, 0) for cell in sorted(owner)])
     shape = tuple((cells.amax(0) + 1).tolist())
-    order = torch.argsort((cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2])
-    grid = SparseGrid.from_cells(cells[order], shape, torch.zeros(3).double(), torch.eye(3).double(), 1.0)
-    return tr.GridLBS.from_labels(grid, torch.tensor(labels)[order], len(boxes))
+    grid = SparseGrid.from_cells(cells, shape, torch.zeros(3).double(), torch.eye(3).double(), 1.0)
+    return tr.GridLBS.from_labels(grid, torch.tensor([owner[cell] for cell in sorted(owner)]), len(boxes))
 
 
 def test_the_tree_takes_the_strongest_joints():
@@ -110,37 +114,31 @@ def test_a_gap_is_bridged_to_what_moves_alike_though_another_bone_is_nearer(batc
     assert model.bridged_moments(REST.repeat(4, 1, 1)).pairs.tolist() == [[0, 1], [0, 3], [2, 3]]
 
 
-def test_bridges_move_and_grow_with_the_space(bones):
+def test_bridges_move_and_grow_with_the_space():
     model = blocks(((0, 4), (0, 0)), ((8, 12), (1, 3)), ((0, 4), (7, 8)))
-    transforms = se3_exp(0.1 * bones.draw(3, 6, seed=1))
-    found, origin = model.bridged_moments(transforms), torch.tensor([1.0, -2.0, 0.5]).double()
-    wide = model.rescaled(50.0, origin)
+    transforms, origin = se3_exp(0.1 * randn(3, 6, seed=1)), torch.tensor([1.0, -2.0, 0.5]).double()
+    found, wide = model.bridged_moments(transforms), model.rescaled(50.0, origin)
     model.set_transforms_(transforms)
     scaled = wide.bridged_moments(model.rescaled(50.0, origin).transforms.detach())
     assert torch.equal(scaled.pairs, found.pairs)
     torch.testing.assert_close(scaled.center, origin + 50 * found.center)
 
 
-JOINT = JointMoments(
-    torch.tensor([[0, 1]]), torch.ones(1).double(), torch.zeros(1, 3).double(), torch.ones(1, 3, 3).double()
-)
-BETA = 0.01
-
-
 @pytest.fixture(scope="module")
 def spread(bones):
-    """Return the spread (3, 3) of a joint whose second bone turns by a rotation vector in each frame."""
+    """The spread (3, 3) of a joint whose second bone turns by a rotation vector in each frame."""
 
     def of(*vectors, **settings):
         turned = [torch.stack([REST, bones.turned_about(torch.zeros(3), vector)])[:, :3, :3] for vector in vectors]
-        return with_stiffness(JOINT, torch.stack(turned), tr.RegisterConfig(**settings), BETA).spread[0]
+        joint = moments([[0, 1]], torch.zeros(1, 3).double(), 1.0)
+        return with_stiffness(joint, torch.stack(turned), tr.RegisterConfig(**settings), BETA).spread[0]
 
     return of
 
 
 @pytest.fixture(scope="module")
 def cost(bones):
-    """Return what a turn by a rotation vector costs at a joint of a spread."""
+    """The cost of a turn by a rotation vector at a joint of a spread."""
 
     def of(spread, *vector):
         turn = bones.turned_about(torch.zeros(3), vector)[:3, :3] - torch.eye(3)
