@@ -3,19 +3,16 @@
 import pytest
 import torch
 
+from tests.geometry.draws import rand, seeded
 from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.paper.segmentation import best_candidates, reuse_labels
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 @pytest.fixture(scope="module")
 def sheet():
     """A flat square of 20 x 20 cells, each with some samples."""
-    points = torch.rand(4000, 3, generator=generator(), dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.02])
+    points = rand(4000, 3) * torch.tensor([1.0, 1.0, 0.02])
     return CellData(SparseGrid.from_points(points, 20, frame="world"), points)
 
 
@@ -23,23 +20,22 @@ def closest_pair(points):
     return float((torch.cdist(points, points) + 10 * torch.eye(len(points))).min())
 
 
-def test_best_candidates_lie_farther_apart_than_random_points(sheet):
-    best = [closest_pair(sheet.points[best_candidates(sheet.points, 12, generator(seed))]) for seed in range(10)]
-    plain = [closest_pair(sheet.points[torch.randperm(4000, generator=generator(seed))[:12]]) for seed in range(10)]
+def test_best_candidates_lie_farther_apart_than_random_points_and_are_those_of_the_generator(sheet):
+    best, plain = [], []
+    for seed in range(10):
+        best.append(closest_pair(sheet.points[best_candidates(sheet.points, 12, seeded(seed))]))
+        plain.append(closest_pair(sheet.points[torch.randperm(4000, generator=seeded(seed))[:12]]))
     assert min(best) > 0.12
     assert sum(best) > 2 * sum(plain)
-
-
-def test_seeds_are_those_of_the_generator_and_no_more_than_points(sheet):
-    first, again, other = (best_candidates(sheet.points, 7, generator(seed)) for seed in (3, 3, 4))
+    first, again, other = (best_candidates(sheet.points, 7, seeded(seed)) for seed in (3, 3, 4))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
-    assert best_candidates(torch.zeros(2, 3), 5, generator()).shape == (5,)
+    assert best_candidates(torch.zeros(2, 3), 5, seeded()).shape == (5,)
 
 
-def split(sheet, squares, num_bones, least=0.01):
+def split(sheet, squares, num_bones):
     labels = (sheet.grid.cell_centers()[:, 0] > 0.5).long()
-    return labels, reuse_labels(sheet, squares, labels, num_bones, least_error=least, generator=generator())
+    return labels, reuse_labels(sheet, squares, labels, num_bones, least_error=0.01, generator=seeded())
 
 
 def test_the_region_with_the_largest_error_is_halved(sheet):

@@ -1,6 +1,5 @@
 """Spin images matched per region, and the motions that these agree on."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -8,6 +7,7 @@ import torch
 
 import torchreg as tr
 from experiments.made_up.walks import walking_figure
+from tests.geometry.draws import seeded
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.paper.spin_matches import spin_matches
@@ -21,13 +21,10 @@ def source():
 
 
 def matches_of(source, target, regions, count):
-    index = torch.arange(0, len(source), 5)
+    index, bin_size = torch.arange(0, len(source), 5), 3 * source.spacing
     config = replace(tr.RegisterConfig.paper().printed, max_distance=60.0)
-    found = spin_matches(
-        source, index, target, regions[index], count, config, bin_size=3 * source.spacing,
-        generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
-    return index, found
+    options = {"bin_size": bin_size, "generator": seeded()}
+    return index, spin_matches(source, index, target, regions[index], count, config, **options)
 
 
 def test_a_scan_that_moved_rigidly_gives_the_motion_of_each_region(source):
@@ -54,4 +51,4 @@ def test_targets_out_of_reach_are_no_candidates(source):
 def test_a_region_without_points_stays(source):
     _, found = matches_of(source, source, torch.zeros(len(source), dtype=torch.int64), 3)
     assert torch.equal(found.motions[1:], torch.eye(4).expand(2, 4, 4))
-    assert math.isclose(float(torch.det(found.motions[0, :3, :3])), 1.0, abs_tol=1e-4)
+    assert float(torch.det(found.motions[0, :3, :3])) == pytest.approx(1, abs=1e-4)
