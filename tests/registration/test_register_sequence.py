@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.geometry.draws import randn
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.registration.dense.align_scans import align_scans
@@ -31,13 +32,13 @@ def test_every_frame_is_reached_from_the_reference(toy, found):
     for frame in range(3):
         errors = (found.deformed[frame] - toy.truth(1, frame)).norm(dim=-1) / toy[1].diagonal
         assert float((errors < 0.025).float().mean()) > 0.85
+    assert float((found.deformed[1] - found.points).norm(dim=-1).mean()) < 0.005 * toy[1].diagonal
     with torch.no_grad():
         torch.testing.assert_close(found.model(found.points), found.deformed, atol=1e-4, rtol=0)
     assert found.status.usable
-
-
-def test_the_reference_stays_where_it_is(toy, found):
-    assert float((found.deformed[1] - found.points).norm(dim=-1).mean()) < 0.005 * toy[1].diagonal
+    assert found.confidence.shape == (3,)
+    assert found.confidence[1] == 1
+    assert 0.5 < float(found.confidence.min()) <= float(found.confidence.max()) <= 1
 
 
 def test_all_points_meet_in_the_pose_of_the_reference(toy, found):
@@ -48,18 +49,11 @@ def test_all_points_meet_in_the_pose_of_the_reference(toy, found):
     assert float(distance.median()) < 0.01
 
 
-def test_confidence_falls_away_from_the_reference(found):
-    assert found.confidence.shape == (3,)
-    assert found.confidence[1] == 1
-    assert 0.5 < float(found.confidence.min()) <= float(found.confidence.max()) <= 1
-
-
 def test_frames_beyond_a_doubtful_one_are_doubtful(toy, monkeypatch):
     sure = iter((0.9, 0.2, 0.7))
 
     def judged(source, *args, **kwargs):
-        plain = align_scans(source, *args, **kwargs)
-        return replace(plain, confidence=next(sure))
+        return replace(align_scans(source, *args, **kwargs), confidence=next(sure))
 
     monkeypatch.setattr("torchreg.registration.register_sequence.align_scans", judged)
     scans = [toy[0].subset(torch.arange(0, len(toy[0]), 2))] * 4
@@ -78,32 +72,28 @@ def test_results_are_the_same_on_disk(found, tmp_path):
     assert back.history == found.history
 
 
-def test_points_are_predicted_by_half_of_a_single_step():
+def test_points_are_predicted_by_half_of_a_single_step_and_hidden_ones_do_not_run_away():
     first, second = torch.zeros(5, 3), torch.ones(5, 3)
     assert Motion().predict([first]) is None
     found = Motion().predict([first, second])
     torch.testing.assert_close(found.places, 1.5 * second)
     # The variance of steps being one, half of each kept leaves three quarters of it.
     assert found.std == pytest.approx(math.sqrt(0.75))
+    # Steps that were all alike go on, but those of a hidden point are predictions themselves.
+    found = Motion().predict([step * torch.ones(2, 3) for step in range(20)], torch.tensor([1.0, 0.0]))
+    torch.testing.assert_close(found.places[0], torch.full((3,), 20.0), rtol=0, atol=0.05)
+    torch.testing.assert_close(found.places[1], torch.full((3,), 19.5))
 
 
 @pytest.mark.parametrize("kept", [0.2, 0.9])
 def test_how_steady_steps_are_is_estimated(kept):
-    generator, steps = torch.Generator().manual_seed(0), [torch.zeros(4000, 3)]
-    for _ in range(40):
-        steps.append(kept * steps[-1] + torch.randn(4000, 3, generator=generator))
-    places = torch.stack(steps).cumsum(0)
-    found = Motion().predict(list(places))
-    torch.testing.assert_close(found.places, places[-1] + kept * steps[-1], rtol=0, atol=0.2)
+    steps = [torch.zeros(4000, 3)]
+    for number in range(40):
+        steps.append(kept * steps[-1] + randn(4000, 3, seed=number).float())
+    positions = torch.stack(steps).cumsum(0)
+    found = Motion().predict(list(positions))
+    torch.testing.assert_close(found.places, positions[-1] + kept * steps[-1], rtol=0, atol=0.2)
     assert found.std == pytest.approx(1, rel=0.05)
-
-
-def test_hidden_points_do_not_run_away():
-    # Steps that were all alike go on, but those of a hidden point are predictions themselves.
-    places = [step * torch.ones(2, 3) for step in range(20)]
-    found = Motion().predict(places, torch.tensor([1.0, 0.0]))
-    torch.testing.assert_close(found.places[0], torch.full((3,), 20.0), rtol=0, atol=0.05)
-    torch.testing.assert_close(found.places[1], torch.full((3,), 19.5))
 
 
 def test_far_frames_are_reached_step_by_step_as_the_config_says(toy):
