@@ -40,11 +40,7 @@ class CloudSurface:
 
 
 def cloud_surface(points: Tensor, name: str = "points") -> CloudSurface:
-    """Return the surface of the body that points (N, 3) lie on, in any order (morphological closing, Serra 1982).
-
-    The radius of the balls is the least, about that of the gaps between points, with which they enclose something;
-    points on one side of a body only give the surface of a shell.
-    """
+    """Return the surface of the body that points (N, 3) lie on, in any order (morphological closing, Serra 1982)."""
     places = enough_places(points, name)
     gap = float(k_nearest_others(places, CLOSING.neighbors)[1][:, -1].quantile(CLOSING.quantile))
     for radius in CLOSING.radii:

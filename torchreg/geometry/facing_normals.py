@@ -31,11 +31,7 @@ _FACING = _Facing()
 
 
 def facing_normals(points: Tensor, viewpoint: Tensor | None = None) -> Tensor:
-    """Return the unit normals (N, 3) of a scan, towards the camera where all points were taken from one side.
-
-    The direction of the camera is the one whose signs tear no smooth surface apart and leave it convex on the whole; if
-    every direction does tear, signs propagate as in `orient_normals`. Zero where noise hides the normal.
-    """
+    """Return the unit normals (N, 3) of a scan, towards the camera where all points were taken from one side."""
     points = points.detach().double()
     spread = float((points.quantile(0.95, dim=0) - points.quantile(0.05, dim=0)).norm())
     count = min(_FACING.max_neighbors + 1, len(points))

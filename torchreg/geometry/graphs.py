@@ -17,17 +17,11 @@ from torchreg.geometry.neighbors import NeighborTree
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Graph:
-    """Nodes joined by edges with lengths, in compressed rows, for shortest paths; made by `from_edges`.
+    """Nodes joined by edges with lengths, in compressed rows, for shortest paths; made by `from_edges`."""
 
-    Args:
-        starts: (V + 1,) int32, the index in ``ends`` of the first neighbor of each node.
-        ends: (2 E,) int32 neighbors of all nodes.
-        lengths: (2 E,) float64 of the edges to them.
-    """
-
-    starts: Tensor
-    ends: Tensor
-    lengths: Tensor
+    starts: Tensor  # (V + 1,) int32, the index in ``ends`` of the first neighbor of each node
+    ends: Tensor  # (2 E,) int32 neighbors of all nodes
+    lengths: Tensor  # (2 E,) float64 of the edges to them
 
     @classmethod
     def from_edges(cls, edges: Tensor, lengths: Tensor, count: int) -> Self:
@@ -100,17 +94,11 @@ def connected_components(edges: Tensor, count: int) -> Tensor:
 
 
 class SpanningForest(NamedTuple):
-    """One tree for each connected component of a graph; its root is its lowest node.
+    """One tree for each connected component of a graph; its root is its lowest node."""
 
-    Args:
-        parents: (V,) int64 parent of each node; -1 for roots.
-        edges: (V,) int64 index of the edge to the parent; -1 for roots.
-        trees: (V,) int64 tree of each node, numbered from 0.
-    """
-
-    parents: Tensor
-    edges: Tensor
-    trees: Tensor
+    parents: Tensor  # (V,) int64 parent of each node; -1 for roots
+    edges: Tensor  # (V,) int64 index of the edge to the parent; -1 for roots
+    trees: Tensor  # (V,) int64 tree of each node, numbered from 0
 
     def chosen(self) -> Tensor:
         """Return the indices (F,) int64 of the edges of all trees, ascending."""
@@ -173,10 +161,7 @@ def component_links(points: Tensor, component: Tensor, count: int = 3) -> tuple[
 
 
 def sorting_order(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stable order (N,) that sorts integers (N,) below count, and the start of each, (count + 1,).
-
-    By the transpose of a sparse matrix, in a fifth of the time of `numpy.argsort`.
-    """
+    """Return the stable order (N,) that sorts integers (N,) below count, and the start of each, (count + 1,)."""
     numbers = np.arange(len(values) + 1, dtype=np.int32)
     entries = csr_array((numbers[:-1], values.astype(np.int32), numbers), shape=(len(values), count)).tocsc()
     return entries.data, entries.indptr

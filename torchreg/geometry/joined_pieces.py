@@ -24,11 +24,7 @@ JOINING = PieceJoining()
 
 
 def join_pieces(inside: Tensor) -> tuple[Tensor, int]:
-    """Return bars (X, Y, Z) bool that join the connected components of a body's voxels, and their number.
-
-    A component is joined by the shortest bar if that is no longer than the component, and not half as large as the
-    largest: so limbs that a gap cuts are joined, and clutter and other bodies are not.
-    """
+    """Return bars (X, Y, Z) bool that join the connected components of a body's voxels, and their number."""
     numbers = numbered_pieces(inside)
     bars = torch.zeros(inside.shape, dtype=torch.bool)
     if int(numbers.max()) < 2:

@@ -192,10 +192,7 @@ def sample_surface(
 
 
 def even_samples(mesh: TriangleMesh, count: int) -> tuple[Tensor, Tensor]:
-    """Return about ``count`` points spread evenly over a surface, without randomness, and their face_index (count,).
-
-    Within a face they follow the R2 sequence (Roberts 2018).
-    """
+    """Return about ``count`` points spread evenly over a surface, without randomness, and their face_index (count,)."""
     cumulative = mesh.face_areas().detach().double().cumsum(0)
     index = torch.arange(count, device=cumulative.device, dtype=torch.float64)
     face = torch.searchsorted(cumulative, (index + 0.5) / count * cumulative[-1]).clamp_max(mesh.num_faces - 1)

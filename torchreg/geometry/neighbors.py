@@ -13,10 +13,7 @@ from torchreg.geometry.budget import BUDGET
 
 
 def nearest_neighbor(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the index (..., N) of the target (..., K, 3) nearest to each point (..., N, 3), and its distance.
-
-    Differentiable in the distance; on a CPU by a k-d tree (Maneewongvatana and Mount 1999), not under `torch.func`.
-    """
+    """Return the index (..., N) of the target (..., K, 3) nearest to each point (..., N, 3), and its distance."""
     batch = points.shape[:-2]
     if batch != targets.shape[:-2]:  # broadcast_shapes is slow, and imports sympy when first called
         batch = torch.broadcast_shapes(batch, targets.shape[:-2])

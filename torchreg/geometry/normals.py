@@ -41,11 +41,7 @@ NORMALS = NormalSettings()
 
 
 def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None) -> Tensor:
-    """Return the unit normals (N, 3) of a surface sampled by points, with the signs of `orient_normals`.
-
-    Each is the direction of least spread of the nearest 16 neighbors, the nearer ones weighing more (Hoppe et al.
-    1992).
-    """
+    """Return the unit normals (N, 3) of a surface sampled by points, with the signs of `orient_normals`."""
     positions, which = distinct_positions(points)
     index, _ = k_nearest_others(positions, NORMALS.num_neighbors)
     return orient_along_graph(positions, fit_normals(positions, index), index, viewpoint)[which].to(points)
@@ -90,11 +86,7 @@ def fit_normals_at(points: Tensor, index: Tensor) -> Tensor:
 
 
 def face_vertex_normals(points: Tensor, faces: Tensor, viewpoint: Tensor | None = None) -> Tensor:
-    """Return unit normals (N, 3) at the points of a surface of triangles, zero where no face has an area.
-
-    Triangles wound against their neighbors are flipped. A component keeps the winding of three quarters of its area or
-    more; without such a majority, or with a viewpoint, it faces the camera as points do.
-    """
+    """Return unit normals (N, 3) at the points of a surface of triangles, zero where no face has an area."""
     pairs, agree = _adjacent_faces(faces, len(points))
     if viewpoint is None and bool(agree.all()):
         return TriangleMesh(points, faces).vertex_normals()

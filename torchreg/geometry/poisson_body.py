@@ -38,17 +38,12 @@ FIT = PoissonFit()
 
 @dataclass(frozen=True, eq=False)
 class PoissonBody:
-    """A body around points.
+    """A body around points."""
 
-    Args:
-        mesh: its closed surface, facing outwards, float64, with the pieces joined by `join_pieces`.
-        joined: number of pieces that were joined.
-        shown: share of its points whose far side is shown by points as well: near one for a body scanned from all
-            sides, near zero for one view.
-    """
-
-    mesh: TriangleMesh
-    joined: int
+    mesh: TriangleMesh  # its closed surface, facing outwards, float64, with the pieces joined by `join_pieces`
+    joined: int  # number of pieces that were joined
+    # share of its points whose far side is shown by points as well: near one for a body scanned from all sides, near
+    # zero for one view
     shown: float
 
     @property
@@ -61,13 +56,11 @@ def poisson_body(points: Tensor) -> PoissonBody:
     """Return the body whose surface points (N, 3) lie on, all different, float64 on the CPU.
 
     With outward normals ``n_i`` and areas ``a_i`` of points ``p_i``, the field ``V = sum a_i n_i delta(x - p_i)`` is
-    that of a closed surface if it is the gradient of an indicator function. The iteration
-    ``n_i <- (P V)(p_i) / |(P V)(p_i)|`` maximizes ``|P V|^2``, convex in the normals, with the part ``P V`` of the
-    blurred field that is a gradient; normals of parts that are inside out, where the indicator is less than outside,
-    are turned over on the way.
-
-    References: Kazhdan, Bolitho and Hoppe 2006, Poisson's equation; Lin, Shi and Liu 2024, normals from the field;
-    Journee, Nesterov, Richtarik and Sepulchre 2010, maxima of convex functions.
+    that of a closed surface if it is the gradient of an indicator function. The iteration ``n_i <- (P V)(p_i) / |(P
+    V)(p_i)|`` maximizes ``|P V|^2``, convex in the normals, with the part ``P V`` of the blurred field that is a
+    gradient; normals of parts that are inside out, where the indicator is less than outside, are turned over on the way
+    (Kazhdan, Bolitho and Hoppe 2006, Poisson's equation; Lin, Shi and Liu 2024, normals from the field; Journee,
+    Nesterov, Richtarik and Sepulchre 2010, maxima of convex functions).
     """
     distance = k_nearest_others(points, FIT.neighbors)[1][:, -1]
     areas = math.pi * distance.square() / FIT.neighbors
@@ -115,10 +108,7 @@ class _Spectrum:
         return self._gradients(self._transformed(weights), width)
 
     def improved_normals(self, vectors: Tensor, width: float) -> tuple[Tensor, Tensor]:
-        """Return better normals (N, 3) from vectors (N, 3), and which points (N,) are inside out.
-
-        Those are the directions of the blurred field's gradient part, and the points of indicator below that outside.
-        """
+        """Return better normals (N, 3) from vectors (N, 3), and which points (N,) are inside out."""
         potential = self._potential(vectors)
         indicator = self._indicator(potential, width)
         return _normalized(self._gradients(potential, width)), self.at_points(indicator) < _outside(indicator)

@@ -27,11 +27,7 @@ _THINNING = _Thinning()
 
 
 def poisson_disk(points: Tensor, radius: float, generator: torch.Generator | None = None) -> Tensor:
-    """Return the indices (M,), ascending, of points more than ``radius`` apart that cover all points (Cook 1986).
-
-    Points come in random order. Regions far denser than the radius are thinned by growing radii first; no point is then
-    farther than one and a half radii from a kept one.
-    """
+    """Return the indices (M,), ascending, of points more than ``radius`` apart that cover all points (Cook 1986)."""
     positions, index = _shuffled_positions(points, generator)
     kept = _thin(positions, np.arange(len(positions)), radius, _median_spacing(positions))
     return torch.from_numpy(np.sort(index[kept])).to(points.device)

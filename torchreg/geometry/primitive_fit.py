@@ -25,10 +25,7 @@ class FittedPrimitive:
 
 
 def fit_primitive(points: Tensor, kind: str = "auto") -> FittedPrimitive:
-    """Return the solid of least mean distance to surface points, metres, each principal axis tried as the long one.
-
-    With "auto", the best kind; fewer than four points, or points on a line, give a thin ellipsoid around them.
-    """
+    """Return the solid of least mean distance to surface points, metres, each principal axis tried as the long one."""
     points = points.detach().double()
     kinds = (kind,) if kind != "auto" else ("ellipsoid",) if _has_no_shape(points) else tuple(PRIMITIVE_KINDS)
     fits = [

@@ -12,17 +12,11 @@ from torchreg.geometry.rigid import rigid_matrix
 
 @dataclass(frozen=True)
 class RigidMoments:
-    """Sufficient statistics for rigid fits of G groups of matched points; those of two groups add up when joined.
+    """Sufficient statistics for rigid fits of G groups of matched points; those of two groups add up when joined."""
 
-    Args:
-        sums: (..., G, 17) weighted sums of 1, x, y, ``|x|^2 + |y|^2`` and ``y x^T``, about the origins.
-        source_origin: (..., 3) subtracted from the points before summing, against cancellation.
-        target_origin: (..., 3) subtracted from the matches.
-    """
-
-    sums: Tensor
-    source_origin: Tensor
-    target_origin: Tensor
+    sums: Tensor  # (..., G, 17) weighted sums of 1, x, y, ``|x|^2 + |y|^2`` and ``y x^T``, about the origins
+    source_origin: Tensor  # (..., 3) subtracted from the points before summing, against cancellation
+    target_origin: Tensor  # (..., 3) subtracted from the matches
 
     @property
     def num_groups(self) -> int:

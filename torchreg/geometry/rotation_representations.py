@@ -55,10 +55,7 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation(rotation: Tensor) -> Tensor:
-    """Return the unit quaternion (w, x, y, z), w not negative, of a rotation matrix (Shepperd 1978).
-
-    From the column of ``4 q q^T`` with the largest diagonal, so no rotation is special.
-    """
+    """Return the unit quaternion (w, x, y, z), w not negative, of a rotation matrix (Shepperd 1978)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
     outer = (
         (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
@@ -73,10 +70,7 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return the rotation vector, of an angle of at most pi, of a quaternion (w, x, y, z); zero gives no rotation.
-
-    At half turns the vector jumps to its negative, but `so3_exp` of it stays smooth.
-    """
+    """Return the rotation vector, of an angle of at most pi, of a quaternion (w, x, y, z); zero gives no rotation."""
     unit = _positive_scalar(_normalized_quaternion(quaternion))
     scalar, vector = unit[..., :1], unit[..., 1:]
     square = (vector * vector).sum(-1, keepdim=True)

@@ -22,13 +22,7 @@ _CROWDING = _Crowding()
 
 
 def draw_spread(points: Tensor, count: int, size: float, generator: torch.Generator) -> Tensor:
-    """Return indices of points drawn at random, of which those in crowded places are drawn more rarely.
-
-    Indices (count,) are all different and ascending. As long as the points (M, 3) lie in some hundreds of places this
-    is a plain draw. Where a few places hold most of the points, as of copies or of a sensor close by, they are drawn as
-    if these held only so many that hundreds of places count; ``size`` is that of what was measured (Efraimidis and
-    Spirakis 2006, weighted sampling without replacement).
-    """
+    """Return indices of points drawn at random, of which those in crowded places are drawn more rarely."""
     place, held = _places(points, size / _CROWDING.cells)
     weight = (_crowded_from(held) / held).clamp_max(1).float()[place]
     waiting = torch.empty(len(points), dtype=torch.float32).exponential_(generator=generator).to(points.device)
@@ -67,10 +61,7 @@ def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
 
 
 def even_order(points: Tensor, count: int | None = None) -> Tensor:
-    """Return the indices (count,) in an order of which every beginning covers the cloud evenly (Gonzalez 1985).
-
-    The first is the farthest from the centroid; the order of equally far points is not defined.
-    """
+    """Return the indices (count,) in an order of which every beginning covers the cloud evenly (Gonzalez 1985)."""
     centered = points.detach().cpu().double().numpy()
     centered = centered - centered.mean(axis=0)
     squares = (centered**2).sum(axis=1)

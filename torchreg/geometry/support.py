@@ -231,10 +231,7 @@ def _fitted(samples: Tensor, plane: Tensor, size: float, center: Tensor) -> _Pla
 
 
 class _View:
-    """Samples as seen along the normal of a plane: on it, above it (the thing), below it (a slab, if not outliers).
-
-    Widths are means over all directions in the plane.
-    """
+    """Samples as seen along the normal of a plane: on it, above it (the thing), below it (a slab, if not outliers)."""
 
     def __init__(self, samples: Tensor, plane: _Plane) -> None:
         heights, self._flat = plane.heights(samples), plane.along(samples)

@@ -36,19 +36,12 @@ _REPAIR = _Repair()
 
 @dataclass(frozen=True, eq=False)
 class OnePiece:
-    """A surface without holes or loose parts, made from any triangles.
+    """A surface without holes or loose parts, made from any triangles."""
 
-    Args:
-        mesh: float64 on the CPU, with the centers of closed holes as last vertices.
-        vertex: (V,) original vertex of each vertex; -1 for the center of a hole.
-        bridges: (B, 2) vertices that count as joined, empty unless pieces were bridged.
-        notes: the repairs, in words.
-    """
-
-    mesh: TriangleMesh
-    vertex: Tensor
-    bridges: Tensor
-    notes: tuple[str, ...]
+    mesh: TriangleMesh  # float64 on the CPU, with the centers of closed holes as last vertices
+    vertex: Tensor  # (V,) original vertex of each vertex; -1 for the center of a hole
+    bridges: Tensor  # (B, 2) vertices that count as joined, empty unless pieces were bridged
+    notes: tuple[str, ...]  # the repairs, in words
 
 
 def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,10 +60,7 @@ def _edge_keys(faces: Tensor) -> tuple[Tensor, int]:
 
 
 def _is_closed(faces: Tensor, keys: Tensor) -> bool:
-    """Return whether every edge of triangles is used as often in one direction as in the other.
-
-    By a sum of pseudo-random numbers of edges, signed by direction: wrong once in 2^64.
-    """
+    """Return whether every edge of triangles is used as often in one direction as in the other."""
     numbers = keys * -7046029254386353131  # the odd integer nearest to 2^64 over the golden ratio, as a signed one
     numbers = (numbers ^ (numbers >> 29)) * numbers
     return int(torch.where(faces < faces.roll(-1, dims=1), numbers, -numbers).sum()) == 0
@@ -116,11 +106,7 @@ def _used_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def coarsened(mesh: TriangleMesh, count: int, area: Tensor | None = None) -> TriangleMesh:
-    """Return a surface with about ``count`` vertices at most, each the mean of a patch of the given ones.
-
-    Vertex clustering (Rossignac and Borrel 1993) within connected patches of cubic cells, so that near sheets and limbs
-    stay apart; vertices of patches that are no disks stay as they are.
-    """
+    """Return a surface with about ``count`` vertices at most, each the mean of a patch of the given ones."""
     if mesh.num_vertices <= count:
         return mesh
     vertices, faces = mesh.vertices, mesh.faces
@@ -200,10 +186,7 @@ def _near_pairs(pieces: list[Tensor]) -> Tensor:
 
 
 def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Return vertices and faces with every rim joined to its mean by triangles, and the number of rims.
-
-    The means come after the old vertices, in no particular order.
-    """
+    """Return vertices and faces with every rim joined to its mean by triangles, and the number of rims."""
     keys, _ = _edge_keys(faces)
     if _is_closed(faces, keys):
         return vertices, faces, 0

@@ -30,10 +30,7 @@ def likely_pair(ratio: float) -> tuple[str, str, float]:
 
 
 def robust_size(points: Tensor) -> float:
-    """Return twice the median distance of finite points (N, 3) from their median, which outliers hardly change.
-
-    Points that mostly lie at one place have that of their bounding box.
-    """
+    """Return twice the median distance of finite points (N, 3) from their median, which outliers hardly change."""
     middle = points.median(0).values
     size = 2 * float((points - middle).norm(dim=-1).median())
     return size or float((points.amax(0) - points.amin(0)).norm())

@@ -123,10 +123,7 @@ def _used_vertices(mesh: TriangleMesh) -> Tensor:
 
 
 def visible_points(mesh: TriangleMesh, points: Tensor, camera: Tensor, *, tolerance: float | None = None) -> Tensor:
-    """Return a mask (N,) of the points that a mesh does not hide from a camera; points behind the camera are hidden.
-
-    Points up to ``tolerance`` behind the nearest surface are on it, two pixels (of 256) by default.
-    """
+    """Return a mask (N,) of the points that a mesh does not hide from a camera; points behind the camera are hidden."""
     points = points.to(mesh.vertices)
     with torch.no_grad():
         view = aim(_used_vertices(mesh), camera, size=_VISIBILITY.resolution)

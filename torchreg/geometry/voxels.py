@@ -49,11 +49,7 @@ class VoxelGrid:
         return within & self.filled[x, y, z]
 
     def mesh(self, smoothing: int = 1) -> TriangleMesh:
-        """Return the closed surface of the filled voxels, facing outwards.
-
-        The volume is averaged ``smoothing`` times, 1-2-1 along each axis; the center of every voxel stays on its side.
-        0 gives the staircase.
-        """
+        """Return the closed surface of the filled voxels, facing outwards."""
         # One more empty layer, so that the surface closes around what touches the border.
         filled = torch.nn.functional.pad(self.filled, (1, 1, 1, 1, 1, 1))
         field = 0.5 - filled.to(self.origin.dtype)
@@ -67,11 +63,7 @@ class VoxelGrid:
 
 
 def voxelize(mesh: TriangleMesh, resolution: int = 128, *, touching: bool = False) -> VoxelGrid:
-    """Return the voxels inside a surface, which may have holes, overlap itself or face inwards.
-
-    A voxel is filled if most of the six rays from its center along the axes leave the surface, by signed crossings or
-    by parity (Nooruddin and Turk 2003). ``touching`` also fills voxels that the surface passes through.
-    """
+    """Return the voxels inside a surface, which may have holes, overlap itself or face inwards."""
     corners = mesh.vertices.detach().double()[mesh.faces]
     lower, upper = corners.amin((0, 1)), corners.amax((0, 1))
     spacing = float((upper - lower).max()) / resolution

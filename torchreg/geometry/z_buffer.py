@@ -21,18 +21,12 @@ class View:
     """A pinhole or parallel camera and its grid of pixels; made by `aim`.
 
     Convention: camera coordinates are (right, down, forward); pixel (row i, column j) covers [j, j+1] x [i, i+1].
-
-    Args:
-        position: (3,) float64, the pinhole; for a parallel view any point of the image plane.
-        rotation: (3, 3) float64 ``R_camera_world``.
-        corner: (2,) float64 image-plane coordinates of the upper left corner of the grid.
-        pitch: size of a pixel: metres for a parallel view, tangent of the angle else.
     """
 
-    position: Tensor
-    rotation: Tensor
-    corner: Tensor
-    pitch: float
+    position: Tensor  # (3,) float64, the pinhole; for a parallel view any point of the image plane
+    rotation: Tensor  # (3, 3) float64 ``R_camera_world``
+    corner: Tensor  # (2,) float64 image-plane coordinates of the upper left corner of the grid
+    pitch: float  # size of a pixel: metres for a parallel view, tangent of the angle else
     width: int
     height: int
     parallel: bool = False
@@ -56,17 +50,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """The z-buffer of a mesh: the nearest face at the center of every pixel.
+    """The z-buffer of a mesh: the nearest face at the center of every pixel."""
 
-    Args:
-        face_index: (H, W) int64, -1 for none.
-        barycentric: (H, W, 3) float64 weights of that face's vertices, perspective-correct.
-        depth: (H, W) float64 along the view, infinite without a face.
-    """
-
-    face_index: Tensor
-    barycentric: Tensor
-    depth: Tensor
+    face_index: Tensor  # (H, W) int64, -1 for none
+    barycentric: Tensor  # (H, W, 3) float64 weights of that face's vertices, perspective-correct
+    depth: Tensor  # (H, W) float64 along the view, infinite without a face
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,10 +30,7 @@ def blend_linear(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
 
 
 def blend_dual_quaternion(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return points moved by the normalized weighted sum of unit dual quaternions (Kavan et al. 2007, eqs. 16-17).
-
-    Quaternions take the sign nearest to that of the largest weight's bone: no blend turns by more than half a turn.
-    """
+    """Return points moved by the normalized weighted sum of unit dual quaternions (Kavan et al. 2007, eqs. 16-17)."""
     real, dual, sign = _signed_quaternions(weights, transforms)
     signed = weights * sign
     return _move(points, signed @ real, signed @ dual)

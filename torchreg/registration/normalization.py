@@ -14,19 +14,14 @@ from torchreg.geometry.rigid import rescale_motions
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """Normalized coordinates ``(x - center) / scale``: about one diagonal long, double precision on the CPU.
-
-    Args:
-        center: (3,) mean of the points, in the user's coordinates.
-        scale: root mean squared distance from it over that of a scan whose bounding box has a diagonal of one.
-    """
+    """Normalized coordinates ``(x - center) / scale``: about one diagonal long, double precision on the CPU."""
 
     # Root mean squared distance from the center over the bounding box's diagonal, for people and animals. Unlike the
     # box, that distance does not change when the points turn.
     SPREAD: ClassVar[float] = 0.23
 
-    center: Tensor
-    scale: float
+    center: Tensor  # (3,) mean of the points, in the user's coordinates
+    scale: float  # root mean squared distance from it over that of a scan whose bounding box has a diagonal of one
 
     @classmethod
     def from_points(cls, points: Tensor) -> Normalization:

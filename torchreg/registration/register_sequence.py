@@ -39,11 +39,7 @@ from torchreg.result import Status
 
 @dataclass(frozen=True)
 class FrameToFrame:
-    """Bounds on the settings by which the reference is transferred from frame to frame, by few large bones.
-
-    Small bones would follow noise, which adds up, as does drift along the surface. A few large bones cannot bend in all
-    joints, so that none of them may be firm.
-    """
+    """Bounds on the settings by which the reference is transferred from frame to frame, by few large bones."""
 
     label_cost: float = 0.002
     smoothness: float = 0.2
@@ -64,13 +60,9 @@ class FrameToFrame:
 
 @dataclass(frozen=True)
 class Motion:
-    """Steps of points from frame to frame as an autoregression whose share and variance are estimated from the steps.
+    """Steps of points from frame to frame as an autoregression whose share and variance are estimated from them."""
 
-    Args:
-        momentum: the prior share of the last step that is kept; with all of it, hidden limbs would run away.
-    """
-
-    momentum: float = 0.5
+    momentum: float = 0.5  # the prior share of the last step that is kept; with all of it, hidden limbs would run away
 
     def predict(self, places: Sequence[Tensor], seen: Tensor | None = None) -> ExpectedPlaces | None:
         """Return the expected positions of points (N, 3) after the places so far, latest last; None before two of them.
@@ -92,23 +84,15 @@ class Motion:
 
 @dataclass(frozen=True)
 class AllFrames:
-    """Bounds on the settings by which all frames are fitted together.
+    """Bounds on the settings by which all frames are fitted together."""
 
-    Args:
-        match_steps: lower bound; borders between parts are drawn by motions, which should have converged.
-        refine_steps: lower bound, unless there are none.
-        rtol: upper bound; displacements along the surface converge slowly.
-        joint_weight: lower bound, unless joints are left out; many frames determine joints well.
-        turn_scale: lower bound, radians; bones hold each other in wide turns too, else each frame loses twists anew.
-        point_to_point: upper bound; positions along the surface drift.
-    """
-
-    match_steps: int = 4
-    refine_steps: int = 3
-    rtol: float = 0.02
-    joint_weight: float = 0.01
+    match_steps: int = 4  # lower bound; borders between parts are drawn by motions, which should have converged
+    refine_steps: int = 3  # lower bound, unless there are none
+    rtol: float = 0.02  # upper bound; displacements along the surface converge slowly
+    joint_weight: float = 0.01  # lower bound, unless joints are left out; many frames determine joints well
+    # lower bound, radians; bones hold each other in wide turns too, else each frame loses twists anew
     turn_scale: float = 0.5
-    point_to_point: float = 0.001
+    point_to_point: float = 0.001  # upper bound; positions along the surface drift
 
     def apply(self, config: RegisterConfig) -> RegisterConfig:
         """Return the settings within the bounds."""
@@ -294,10 +278,7 @@ def _sequence_registration(
 def _back_to_reference(
     scans: Sequence[RangeScan], moved: Tensor, weights: Tensor, transforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return all points (K, 3) of all scans in the pose of the reference, their normals and their frames (K,).
-
-    Each moves by the inverse motion of the nearest point of the moved reference (T, N, 3), of weights (N, B).
-    """
+    """Return all points (K, 3) of all scans in the pose of the reference, their normals and their frames (K,)."""
     points, normals, frames = [], [], []
     for frame, scan in enumerate(scans):
         nearest, _ = nearest_neighbor(scan.points, moved[frame])

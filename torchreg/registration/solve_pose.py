@@ -72,12 +72,9 @@ class SolvePoseConfig:
 
 @dataclass(frozen=True)
 class _FirstDamping:
-    """Damping of the first step, which grows with the squared distance of the handles from their targets.
+    """Damping of the first step, which grows with the squared distance of the handles from their targets."""
 
-    Args:
-        far: root mean squared distance, as a share of the model's size, at which displacements cost like residuals.
-    """
-
+    # root mean squared distance, as a share of the model's size, at which displacements cost like residuals
     far: float = 0.2
     least: float = 1e-3
     most: float = 1.0
@@ -257,10 +254,7 @@ class _JointTree:
         return (self._parents[first] == second) | (self._parents[second] == first)
 
     def retract(self, transforms: Tensor, twists: Tensor, fixed: Tensor | None = None) -> Tensor:
-        """Return motions updated by twists about the bones' centers, shifted so that joints open as to first order.
-
-        Bones that turn far leave their joints along tangents: without the shift, stiff joints allow small turns alone.
-        """
+        """Return motions updated by twists about the bones' centers, shifted so that joints open as to first order."""
         centers = transform_points(transforms, self._centers.unsqueeze(-2)).squeeze(-2)
         moved = turn_about(transforms, twists, centers)
         # The end of every joint on each of its bones, and how far the update takes it from its first-order motion.

@@ -28,50 +28,33 @@ AnySystem = TypeVar("AnySystem", bound=System)
 
 @dataclass(frozen=True)
 class DampingRule:
-    """Update of the damping after a step.
+    """Update of the damping after a step."""
 
-    Args:
-        trusted: share of the predicted decrease from which the quadratic model counts as valid.
-        down: factor after a step with such a decrease.
-        doubtful: factor after a step with a smaller decrease.
-        up: factor after a step that raised the cost, or whose system could not be solved.
-    """
-
-    trusted: float
-    down: float
-    doubtful: float
-    up: float
+    trusted: float  # share of the predicted decrease from which the quadratic model counts as valid
+    down: float  # factor after a step with such a decrease
+    doubtful: float  # factor after a step with a smaller decrease
+    up: float  # factor after a step that raised the cost, or whose system could not be solved
     least: float
     most: float = 1e7
 
 
 class Trial(NamedTuple, Generic[State]):
-    """A step before its cost is known.
-
-    Args:
-        promised: (...) decrease of the cost in the quadratic model, ``-g^T s / 2``.
-        sound: (...) False where the damped system had no solution and the step is zero.
-    """
+    """A step before its cost is known."""
 
     state: State
     step: Tensor
-    promised: Tensor
-    sound: Tensor
+    promised: Tensor  # (...) decrease of the cost in the quadratic model, ``-g^T s / 2``
+    sound: Tensor  # (...) False where the damped system had no solution and the step is zero
 
 
 class Descent(NamedTuple, Generic[State, AnySystem]):
-    """State of lowest cost, and the system around it, of which only the cost is up to date after ``final_cost``.
-
-    Args:
-        last_step: the last accepted step, zero if there was none.
-        num_steps: steps tried.
-    """
+    """State of lowest cost, and the system around it, of which only the cost is up to date after ``final_cost``."""
 
     state: State
     system: AnySystem
     damping: Tensor
-    last_step: Tensor
-    num_steps: int
+    last_step: Tensor  # the last accepted step, zero if there was none
+    num_steps: int  # steps tried
     done: Tensor
 
 

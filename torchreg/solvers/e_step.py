@@ -35,26 +35,16 @@ _KERNEL = _Kernel()
 
 @dataclass(frozen=True)
 class EStep:
-    """Sufficient statistics of the posterior for the M-step.
+    """Sufficient statistics of the posterior for the M-step."""
 
-    Args:
-        weights: (..., N) lambda_i, the total posterior of the data of each model point.
-        targets: (..., N, 3) G_i, the weighted mean of its data; the model point itself if it has none.
-        inlier_posterior: (..., M) probability that a datum belongs to any model point.
-        squared_error: (...) sum over i and j of alpha_ij |Y_j - X_i|^2.
-    """
-
-    weights: Tensor
-    targets: Tensor
-    inlier_posterior: Tensor
-    squared_error: Tensor
+    weights: Tensor  # (..., N) lambda_i, the total posterior of the data of each model point
+    targets: Tensor  # (..., N, 3) G_i, the weighted mean of its data; the model point itself if it has none
+    inlier_posterior: Tensor  # (..., M) probability that a datum belongs to any model point
+    squared_error: Tensor  # (...) sum over i and j of alpha_ij |Y_j - X_i|^2
 
 
 def outlier_constant(num_points: int, sigma: Tensor, volume: Tensor) -> Tensor:
-    """Return c of eq. 18, ``3 sqrt(pi / 2) (1 - n v / V)`` with ``v = 4 pi sigma^3 / 3``, the bracket at least 0.05.
-
-    The working volume V is in cubic metres, see `working_volume` (Dewaele et al. 2006).
-    """
+    """Return c of eq. 18, ``3 sqrt(pi / 2) (1 - n v / V)`` with ``v = 4 pi sigma^3 / 3``, the bracket at least 0.05."""
     matched = num_points * 4 / 3 * math.pi * sigma**3
     return OUTLIER_CONSTANT * (1 - matched / volume).clamp_min(_KERNEL.min_free_share)
 

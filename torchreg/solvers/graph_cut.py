@@ -58,10 +58,8 @@ def alpha_expansion(
     positions p (E, L, D) to which two labels move the edge, in units of the distance at which the cost saturates.
 
     Each expansion is one minimum cut; the energy never rises. Two labels end in the least energy, more labels, without
-    label costs and with ``U >= 0``, within ``2 max V_ij / min V_ij`` times the least (2 for Potts).
-
-    References: Boykov, Veksler and Zabih 2001; Kolmogorov and Zabih 2004; Delong et al. 2012 for label costs; Kwatra et
-    al. 2003 for seams.
+    label costs and with ``U >= 0``, within ``2 max V_ij / min V_ij`` times the least (2 for Potts; Boykov, Veksler and
+    Zabih 2001; Kolmogorov and Zabih 2004; Delong et al. 2012 for label costs; Kwatra et al. 2003 for seams).
     """
     num_labels = unary.shape[1]
     seams = None
@@ -143,11 +141,7 @@ class _LabelingEnergy:
         return costs if self.seams is None else costs + self.seams(first, second)
 
     def _label_nodes(self, labels: Integers, alpha: int) -> tuple[Floats, Integers, Floats]:
-        """Return terminal costs, edges and arcs of an auxiliary node per label whose cost a move can save or incur.
-
-        A used label's node stays with the source, and pays, unless all of the label's nodes move; the node of an unused
-        alpha joins the sink, and pays, as soon as one node moves.
-        """
+        """Return terminal costs, edges and arcs of an auxiliary node per label whose cost a move can save or incur."""
         used = np.bincount(labels, minlength=len(self.label_costs)) > 0
         costly = np.flatnonzero((self.label_costs > 0) & (used | (np.arange(len(used)) == alpha)))
         costly = costly[(costly != alpha) | ~used[alpha]]
@@ -222,10 +216,7 @@ def min_cut(unary: Floats, edges: Integers, forward: Floats, backward: Floats) -
 def _plain_sides(
     unary: Floats, edges: Integers, forward: Floats, backward: Floats
 ) -> tuple[NDArray[np.int8], Floats, Integers]:
-    """Return sides (1 sink, 0 source, -1 open) of the nodes, costs that count fixed neighbors, and open edges.
-
-    A node that pays more on a side than all its arcs could save there belongs to the opposite side in any case.
-    """
+    """Return sides (1 sink, 0 source, -1 open) of the nodes, costs that count fixed neighbors, and open edges."""
     num_nodes = len(unary)
     fixed = np.full(num_nodes, -1, dtype=np.int8)
     alive = np.flatnonzero((forward > 0) | (backward > 0))

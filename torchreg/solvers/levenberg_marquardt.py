@@ -32,17 +32,11 @@ _DAMPING = _Damping()
 
 
 class Linearization(NamedTuple):
-    """A least-squares problem around a state, for every problem of the batch.
+    """A least-squares problem around a state, for every problem of the batch."""
 
-    Args:
-        cost: (B,) half the weighted sum of squared residuals.
-        gradient: (B, D) of the cost.
-        hessian: (B, D, D) its Gauss-Newton approximation ``J^T W J``.
-    """
-
-    cost: Tensor
-    gradient: Tensor
-    hessian: Tensor
+    cost: Tensor  # (B,) half the weighted sum of squared residuals
+    gradient: Tensor  # (B, D) of the cost
+    hessian: Tensor  # (B, D, D) its Gauss-Newton approximation ``J^T W J``
 
     def plus(self, other: Linearization) -> Linearization:
         """Return the problem whose cost is the sum of both."""
@@ -76,9 +70,8 @@ def levenberg_marquardt(
     """Return the states of lowest cost by steps ``(H + damping diag(H)) s = -g``, each problem of the batch by itself.
 
     Variables at a limit whose gradient pushes outwards are frozen for the step, others clamped at it. All problems stop
-    when the largest step component of each is at most ``atol``; ``cost`` is a cheaper cost (B,) for the last trial.
-
-    References: Marquardt 1963; Bertsekas 1982 for the limits.
+    when the largest step component of each is at most ``atol``; ``cost`` is a cheaper cost (B,) for the last trial
+    (Marquardt 1963; Bertsekas 1982 for the limits).
     """
     low = state.new_full(state.shape[-1:], -torch.inf) if lower is None else lower
     high = state.new_full(state.shape[-1:], torch.inf) if upper is None else upper

@@ -44,24 +44,17 @@ _SETTINGS = _EliminationSettings()
 
 @dataclass(frozen=True)
 class NNLSResult:
-    """A non-negative least-squares solution.
-
-    Args:
-        objective: squared residual at ``x``.
-        kkt_residual: largest violation of the optimality conditions (slope where x > 0, negative slope where x = 0),
-            with every variable scaled to unit curvature, relative to the largest slope at x = 0.
-        ridge: added to the Hessian as a share of its diagonal because that was singular; 0 if none was needed.
-        num_steps: rounds of freeing variables.
-        converged: whether ``kkt_residual`` came below the tolerance, without the ridge.
-    """
+    """A non-negative least-squares solution."""
 
     x: Tensor
-    objective: float
+    objective: float  # squared residual at ``x``
+    # largest violation of the optimality conditions (slope where x > 0, negative slope where x = 0), with every
+    # variable scaled to unit curvature, relative to the largest slope at x = 0
     kkt_residual: float
-    ridge: float
-    num_steps: int
+    ridge: float  # added to the Hessian as a share of its diagonal because that was singular; 0 if none was needed
+    num_steps: int  # rounds of freeing variables
     num_solves: int
-    converged: bool
+    converged: bool  # whether ``kkt_residual`` came below the tolerance, without the ridge
 
 
 def nnls(
@@ -71,9 +64,7 @@ def nnls(
 
     The free variables are solved and the negative ones held at zero, until none is; then variables at zero with a
     negative slope are freed. A round that does not lower the objective is repeated in steps that always do, so it
-    cannot cycle.
-
-    References: Schaefer and Yuksel 2007 for the elimination; Lawson and Hanson 1974 for the steps that cannot cycle.
+    cannot cycle (Schaefer and Yuksel 2007 for the elimination; Lawson and Hanson 1974 for the steps that cannot cycle).
     """
     a, b = _csr(matrix), target.detach().cpu().double().numpy()
     hessian, linear = (a.T @ a).tocsr(), a.T @ b
@@ -246,10 +237,7 @@ def _eliminate(problem: _Quadratic, free: Flags, start: Floats) -> Floats:
 
 
 def _descend(problem: _Quadratic, y: Floats, entering: Flags) -> Floats:
-    """Return a point of lower value: the minimum over the positive and entering variables, approached within y >= 0.
-
-    ``y`` is the minimum over its positive variables, so an entering one comes out positive however many are dropped.
-    """
+    """Return a point of lower value: the minimum over the positive and entering variables, approached within y >= 0."""
     fine = _SETTINGS.fine * problem.tol
     y, positive = y.copy(), y > 0
     while True:

@@ -32,19 +32,12 @@ _SAMPLING = _Sampling()
 
 @dataclass(frozen=True)
 class RansacResult:
-    """Rigid motions that many matches support, best first; a batch of groups adds its dimensions in front.
+    """Rigid motions that many matches support, best first; a batch of groups adds its dimensions in front."""
 
-    Args:
-        transforms: (K, 4, 4), source to target; the identity if fewer than K distinct ones were found.
-        inliers: (K, N) True for matches within the threshold.
-        counts: (K,) int64 number of inliers; 0 for motions that were not found.
-        scores: (K,) weighted sum of ``1 - r^2 / threshold^2`` over the inliers, by which motions are ranked.
-    """
-
-    transforms: Tensor
-    inliers: Tensor
-    counts: Tensor
-    scores: Tensor
+    transforms: Tensor  # (K, 4, 4), source to target; the identity if fewer than K distinct ones were found
+    inliers: Tensor  # (K, N) True for matches within the threshold
+    counts: Tensor  # (K,) int64 number of inliers; 0 for motions that were not found
+    scores: Tensor  # (K,) weighted sum of ``1 - r^2 / threshold^2`` over the inliers, by which motions are ranked
 
 
 @torch.no_grad()
@@ -68,9 +61,8 @@ def ransac_rigid(
     The first match of a sample is drawn by weight, each further one among those that preserve the distances (and angles
     of normals) to those before; three, or two with normals, determine a motion. The best motions are refitted to their
     inliers, and must move the points apart by ``min_difference`` thresholds (root mean square) to be distinct. Angles
-    are in radians; matches of weight zero, or masked False, are no inliers.
-
-    References: Fischler and Bolles 1981; Torr and Zisserman 2000 for the score.
+    are in radians; matches of weight zero, or masked False, are no inliers (Fischler and Bolles 1981; Torr and
+    Zisserman 2000 for the score).
     """
     normals = None if source_normals is None or target_normals is None else (source_normals, target_normals)
     matches = _Matches.from_rows(source, target, normals, weights, mask, threshold=threshold, max_angle=max_angle)

@@ -7,11 +7,7 @@ from torch import Tensor
 
 
 def nearest_on_simplex(rows: Tensor) -> Tensor:
-    """Return ``argmin_x |x - v|^2`` subject to ``x >= 0, sum_j x_j = 1`` for every row v of rows (..., B).
-
-    The solution is ``max(v - theta, 0)``, theta given by the largest entries (Held, Wolfe and Crowder 1974; Duchi et
-    al. 2008).
-    """
+    """Return ``argmin_x |x - v|^2`` subject to ``x >= 0, sum_j x_j = 1`` for every row v of rows (..., B)."""
     # An amount added to a whole row changes nothing, and entries more than one below the largest end at zero: so
     # large rows keep their digits.
     exact = rows.double()

@@ -14,28 +14,16 @@ _NUM_SCALINGS = 200  # of rows and columns, towards sums of one: what is sure co
 
 @dataclass(frozen=True, eq=False)
 class TrackGraph:
-    """N detections, and the log-odds of their links, starts and stops.
+    """N detections, and the log-odds of their links, starts and stops."""
 
-    Args:
-        links: (E, 2) an earlier detection and a later one, each pair once.
-        gains: (E,) log-odds that the second continues the first, against chance.
-        real: (N,) log-odds that a detection is not clutter.
-        starts: (N,) log-probability that a track starts with it.
-        stops: (N,) log-probability that a track stops with it.
-    """
-
-    links: Tensor
-    gains: Tensor
-    real: Tensor
-    starts: Tensor
-    stops: Tensor
+    links: Tensor  # (E, 2) an earlier detection and a later one, each pair once
+    gains: Tensor  # (E,) log-odds that the second continues the first, against chance
+    real: Tensor  # (N,) log-odds that a detection is not clutter
+    starts: Tensor  # (N,) log-probability that a track starts with it
+    stops: Tensor  # (N,) log-probability that a track stops with it
 
     def best_tracks(self) -> tuple[Tensor, Tensor, float]:
-        """Return the links (E,) of the most probable tracks, bool, which detections (N,) are real, and the score.
-
-        One assignment of each detection to its successor, to a stop, or, if it is clutter, to itself (Zhang, Li and
-        Nevatia 2008).
-        """
+        """Return the links (E,) of the most probable tracks, bool, which detections (N,) are real, and the score."""
         count = len(self.real)
         numbers, (first, second) = torch.arange(count), self.links.unbind(1)
         rows = torch.cat((numbers, first, numbers, count + numbers, count + numbers, count + second))

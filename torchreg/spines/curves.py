@@ -64,10 +64,7 @@ def bend_angles(curves: Tensor) -> Tensor:
 
 
 def tangents(curves: Tensor) -> Tensor:
-    """Return the unit tangents (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends.
-
-    Where points coincide it is the direction of the chord from end to end; +x for a curve without length.
-    """
+    """Return the unit tangents (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends."""
     steps = curves[..., 1:, :] - curves[..., :-1, :]
     padded = torch.cat((steps[..., :1, :], steps, steps[..., -1:, :]), dim=-2)
     central = padded[..., 1:, :] + padded[..., :-1, :]

@@ -19,14 +19,10 @@ Tips = frozenset[int]
 
 @dataclass(frozen=True)
 class LimbGraph:
-    """A tree of limbs with labeled tips, without positions: the G of a spine (Buneman 1971).
+    """A tree of limbs with labeled tips, without positions: the G of a spine (Buneman 1971)."""
 
-    Args:
-        num_tips: K, at least 2; the tips are the nodes 0 to K - 1, the junctions follow.
-        splits: one per limb between two junctions; of any two, one contains the other or they share no tip.
-    """
-
-    num_tips: int
+    num_tips: int  # K, at least 2; the tips are the nodes 0 to K - 1, the junctions follow
+    # one per limb between two junctions; of any two, one contains the other or they share no tip
     splits: frozenset[Tips]
 
     @cached_property

@@ -52,10 +52,7 @@ class PriorSkeleton:
         return observe_limbs(self.skeleton, range(self.num_tips), self.graph, num_samples)
 
     def fitted(self, skeletons: Sequence[Skeleton], num_tips: int | None) -> PriorSkeleton:
-        """Return the prior scaled to the frames with the number of tips nearest to its own.
-
-        Sizes are compared by the mean path from tip to tip, which neither bending nor a lost limb changes much.
-        """
+        """Return the prior scaled to the frames with the number of tips nearest to its own."""
         counts = [len(skeleton.tips) for skeleton in skeletons]
         common = most_frequent_count(counts)
         if num_tips is None and self.num_tips < common:

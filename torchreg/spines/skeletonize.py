@@ -184,20 +184,14 @@ def _prepared(mesh: TriangleMesh, config: SkeletonizeConfig) -> _Body:
 
 @dataclass(frozen=True, eq=False)
 class _SurfaceTips:
-    """The K tips of a body, two or more.
-
-    Args:
-        vertices: (K,) of the surface.
-        distances: (K, V) geodesic distances from them.
-        spacing: between levels of these distances, and so between nodes.
-    """
+    """The K tips of a body, two or more."""
 
     positions: Tensor
-    vertices: Tensor
+    vertices: Tensor  # (K,) of the surface
     confidence: Tensor
-    distances: Tensor
+    distances: Tensor  # (K, V) geodesic distances from them
     relations: TipRelations
-    spacing: float
+    spacing: float  # between levels of these distances, and so between nodes
     notes: tuple[str, ...]
 
 

@@ -151,11 +151,7 @@ class ReducedFit:
         return float(fit.energy.mean())
 
     def update_correspondences(self, progress: float) -> None:
-        """Match the moved samples anew, with thresholds that tighten as ``progress`` goes from 0 to 1.
-
-        A matched sample's target is its aligned position on the match's tangent plane, that of others the aligned
-        position.
-        """
+        """Match the moved samples anew, with thresholds that tighten as ``progress`` goes from 0 to 1."""
         moved, normals = self.moved(self.samples.points, self.samples.normals)
         max_distance = geometric_at(self.config.max_distance, progress)
         max_angle = geometric_at(self.config.max_angle, progress)

@@ -14,27 +14,18 @@ from torchreg.geometry.range_scan import RangeScan
 
 @dataclass(frozen=True)
 class CompatibleMatches:
-    """The closest points of N points, with normals, and masks (N,) of matches that hold or why they were dropped.
-
-    Args:
-        boundary: True where it was dropped because the target lies on a boundary of its scan.
-        far: True where it was dropped because of its distance alone.
-        turned: True where it was dropped because of its normals alone.
-    """
+    """The closest points of N points, with normals, and masks (N,) of matches that hold or why they were dropped."""
 
     targets: Tensor
     normals: Tensor
     kept: Tensor
-    boundary: Tensor
-    far: Tensor
-    turned: Tensor
+    boundary: Tensor  # True where it was dropped because the target lies on a boundary of its scan
+    far: Tensor  # True where it was dropped because of its distance alone
+    turned: Tensor  # True where it was dropped because of its normals alone
 
 
 class CompatibleMatcher:
-    """The matches ``argmin_y |x - y|^2 + s^2 |n - n_y|^2`` in a target scan, by a tree over points and normals.
-
-    The scale s is the distance that counts as much as normals 60 degrees apart (Chang and Zwicker 2009, section 4.1).
-    """
+    """The matches ``argmin_y |x - y|^2 + s^2 |n - n_y|^2`` in a target scan, by a tree over points and normals."""
 
     # Sampling distances of the target below which the largest distance of a match never falls.
     LEAST_SPACINGS: ClassVar[float] = 2.0

@@ -13,18 +13,12 @@ from torchreg.errors import InputError
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Targets (..., N, 3) of N points in each problem of a batch, and how residuals from them are measured.
-
-    Args:
-        normals: (..., N, 3) unit normals at the targets; None measures from point to point alone.
-        weights: (..., N) not negative, zero for a dropped match, whose target and normal may be anything.
-        point_to_point: share s of the point-to-point distance, see `squared_residuals`.
-    """
+    """Targets (..., N, 3) of N points in each problem of a batch, and how residuals from them are measured."""
 
     targets: Tensor
-    normals: Tensor | None
-    weights: Tensor
-    point_to_point: float = 1.0
+    normals: Tensor | None  # (..., N, 3) unit normals at the targets; None measures from point to point alone
+    weights: Tensor  # (..., N) not negative, zero for a dropped match, whose target and normal may be anything
+    point_to_point: float = 1.0  # share s of the point-to-point distance, see `squared_residuals`
 
     def squared_residuals(self, positions: Tensor) -> Tensor:
         """Return the squared residuals (F, ..., N) of positions (F, ..., N, 3), several for each of F frames."""
@@ -72,10 +66,7 @@ class ScanDistance(nn.Module):
     def forward(
         self, moved: Tensor, targets: Tensor, normals: Tensor | None = None, match_weights: Tensor | None = None
     ) -> Tensor:
-        """Return the loss (...) of every problem of the batch, squared units, zero where all match weights are.
-
-        Moved points, targets and unit normals are (..., N, 3), match weights (..., N); a dropped match has weight zero.
-        """
+        """Return the loss (...) of every problem of the batch, squared units, zero where all match weights are."""
         check_shape(moved, "moved", ("N", 3), batch=True)
         check_shape(targets, "targets", (moved.shape[-2], 3), batch=True)
         check_same_kind(moved, "moved", targets, "targets")

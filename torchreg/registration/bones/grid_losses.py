@@ -16,10 +16,7 @@ class JointEnergy(nn.Module):
     """
 
     def forward(self, transforms: Tensor, moments: JointMoments, pair_weights: Tensor | None = None) -> Tensor:
-        """Return the energy (...) of every pose of the batch, squared units.
-
-        ``pair_weights``: (..., P) of the joints, zero for one that does not hold; ones by default.
-        """
+        """Return the energy (...) of every pose of the batch, squared units."""
         per_pair = self.per_pair(transforms, moments)
         if pair_weights is None:
             return per_pair.sum(-1)

@@ -15,15 +15,10 @@ from torchreg.registration.bones.sparse_grid import SparseGrid
 
 @dataclass(frozen=True)
 class Negligible:
-    """Amounts that count as nothing.
+    """Amounts that count as nothing."""
 
-    Args:
-        weight: of a bone at a corner: rounding of normalized weights.
-        mass: of a pair of bones, as a share of a cell's volume.
-    """
-
-    weight: float = 1e-9
-    mass: float = 1e-6
+    weight: float = 1e-9  # of a bone at a corner: rounding of normalized weights
+    mass: float = 1e-6  # of a pair of bones, as a share of a cell's volume
 
 
 NEGLIGIBLE = Negligible()
@@ -35,18 +30,12 @@ class JointMoments:
 
     ``tau_ij int w_i w_j |T_i x - T_j x|^2 dx = |T_i c - T_j c|^2 + tr(D S D^T)``, ``D = R_i - R_j``: eq. 4 in closed
     form, free of the cancellation of moments about a far origin.
-
-    Args:
-        pairs: (P, 2) int64 bones that share weight, the lower first, in order.
-        mass: (P,) ``m = int w_i w_j dx``, cubic units; tau is its inverse.
-        center: (P, 3) ``c = int w_i w_j x dx / m``.
-        spread: (P, 3, 3) ``S = int w_i w_j (x - c) (x - c)^T dx / m``, squared units.
     """
 
-    pairs: Tensor
-    mass: Tensor
-    center: Tensor
-    spread: Tensor
+    pairs: Tensor  # (P, 2) int64 bones that share weight, the lower first, in order
+    mass: Tensor  # (P,) ``m = int w_i w_j dx``, cubic units; tau is its inverse
+    center: Tensor  # (P, 3) ``c = int w_i w_j x dx / m``
+    spread: Tensor  # (P, 3, 3) ``S = int w_i w_j (x - c) (x - c)^T dx / m``, squared units
 
     @classmethod
     def none(cls) -> JointMoments:
@@ -78,11 +67,7 @@ def gaps_at(differences: Tensor, centers: Tensor) -> Tensor:
 def joint_moments(
     grid: SparseGrid, weights: Tensor, *, min_mass: float = NEGLIGIBLE.mass, pairs: Tensor | None = None
 ) -> JointMoments:
-    """Return mass, center and spread of ``w_i w_j`` for the pairs of bones that share weight, exactly (eq. 4).
-
-    Pairs below ``min_mass`` of a cell's volume are left out. Given ``pairs`` (P, 2) are returned instead, summed over
-    all cells that either bone reaches, so that the gradient is right where a weight is zero.
-    """
+    """Return mass, center and spread of ``w_i w_j`` for the pairs of bones that share weight, exactly (eq. 4)."""
     size = weights.shape[1]
     with torch.no_grad():
         reached = (weights.detach().abs() > NEGLIGIBLE.weight)[grid.cell_corners].any(1)
@@ -140,10 +125,7 @@ def _cells_of_pairs(reached: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor, Ten
 
 @cache
 def _cell_forms() -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return (64, 13): the integrals of products of two corners' shape functions with 1, y_a and y_a y_b.
-
-    y runs from -1/2 to 1/2 over the unit cell. Three Gauss points per axis integrate degree 5 exactly.
-    """
+    """Return (64, 13): the integrals of products of two corners' shape functions with 1, y_a and y_a y_b."""
     nodes, gauss = np.polynomial.legendre.leggauss(3)
     y, weight = nodes / 2, gauss / 2
     grid = np.stack(np.meshgrid(y, y, y, indexing="ij"), axis=-1).reshape(-1, 3)

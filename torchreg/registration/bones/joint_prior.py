@@ -14,15 +14,10 @@ from torchreg.solvers.robust import cauchy_weight, geman_mcclure_weight
 
 @dataclass(frozen=True)
 class _Hinges:
-    """Evidence that the axis of a hinge needs.
+    """Evidence that the axis of a hinge needs."""
 
-    Args:
-        least_frames: between two frames every motion turns about one axis.
-        clear_turn: angle between bones, radians, at which an axis counts half.
-    """
-
-    least_frames: int = 3
-    clear_turn: float = 0.03
+    least_frames: int = 3  # between two frames every motion turns about one axis
+    clear_turn: float = 0.03  # angle between bones, radians, at which an axis counts half
 
 
 _HINGES = _Hinges()
@@ -35,11 +30,7 @@ def joint_weights(gaps: Tensor, scale: float) -> Tensor:
 
 
 def with_stiffness(moments: JointMoments, rotations: Tensor, config: BoneConfig, joint_weight: float) -> JointMoments:
-    """Return joints as points, with a spread by which the joint energy penalizes turns of bones against each other.
-
-    ``|R_i - R_j|^2`` is about twice the squared angle, and a spread ``s I`` costs s times as much, divided by beta
-    here. The weights are robust: the wider bones turn against each other, the less they resist.
-    """
+    """Return joints as points, with a spread by which the joint energy penalizes turns of bones against each other."""
     first, second = rotations[..., moments.pairs.mT, :, :].unbind(-4)
     differences = first - second
     squares = (differences.mT @ differences).mean(0)
@@ -52,11 +43,7 @@ def with_stiffness(moments: JointMoments, rotations: Tensor, config: BoneConfig,
 
 
 def _hinge_spread(squares: Tensor, config: BoneConfig) -> Tensor:
-    """Return spreads (P, 3, 3) along hinge axes, of means (P, 3, 3) of ``(R_i - R_j)^T (R_i - R_j)``.
-
-    A hinge is a pin along its axis, which both bones must keep to; it holds less where motions determine the axis
-    poorly.
-    """
+    """Return spreads (P, 3, 3) along hinge axes, of means (P, 3, 3) of ``(R_i - R_j)^T (R_i - R_j)``."""
     chords, axes = torch.linalg.eigh(squares)
     axis, (least, second, _) = axes[..., 0], chords.clamp(min=0).unbind(-1)
     clarity = (second - least) / (second + _HINGES.clear_turn**2)

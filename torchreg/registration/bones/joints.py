@@ -15,15 +15,11 @@ from torchreg.registration.bones.joint_moments import JointMoments, gaps_at, mot
 
 @dataclass(frozen=True)
 class Regularization:
-    """Lambda of `find_joints`, squared radians.
+    """Lambda of `find_joints`, squared radians."""
 
-    Args:
-        found: of joints found from motions that are given.
-        fitted: of joints fitted with the motions: bones share weight at the surface, joints lie inside, and a firmer
-            lambda draws them out, by up to a limb's radius.
-    """
-
-    found: float = 0.01
+    found: float = 0.01  # of joints found from motions that are given
+    # of joints fitted with the motions: bones share weight at the surface, joints lie inside, and a firmer lambda draws
+    # them out, by up to a limb's radius
     fitted: float = 0.001
 
 
@@ -32,18 +28,12 @@ REGULARIZATION = Regularization()
 
 @dataclass(frozen=True)
 class Joints:
-    """Joints of pairs (P, 2) of bones.
-
-    Args:
-        centers: (P, 3), where the two motions of a pair agree, in the space that the motions start from.
-        mass: (P,) of what the bones of a pair share, see `JointMoments`; zero for those that only come near.
-        gaps: (..., P) distances between the images of each center under the two motions.
-    """
+    """Joints of pairs (P, 2) of bones."""
 
     pairs: Tensor
-    centers: Tensor
-    mass: Tensor
-    gaps: Tensor
+    centers: Tensor  # (P, 3), where the two motions of a pair agree, in the space that the motions start from
+    mass: Tensor  # (P,) of what the bones of a pair share, see `JointMoments`; zero for those that only come near
+    gaps: Tensor  # (..., P) distances between the images of each center under the two motions
 
 
 @dataclass(frozen=True)
@@ -80,12 +70,7 @@ def bridged(
     *,
     regularization: float = REGULARIZATION.found,
 ) -> JointMoments:
-    """Return moments with pairs added, of no mass and spread, that join groups of bones which share no weight.
-
-    A scan falls apart where something nearer hides a joint. Between two groups the pair is added with the least sum of
-    three lengths: the distance of their nearest corners (K, 3), that from their middle to the point that both bones
-    move alike, and the gap of their motions there.
-    """
+    """Return moments with pairs added, of no mass and spread, that join groups of bones which share no weight."""
     group, bone = connected_components(moments.pairs, weights.shape[1]), weights.argmax(1)
     if len(group[bone].unique()) < 2:
         return moments

@@ -20,22 +20,16 @@ from torchreg.solvers.graph_cut import alpha_expansion
 
 @dataclass(frozen=True, eq=False)
 class CellData:
-    """A grid of C cells, and sample points (n, 3) of the surface in it, before they are moved.
-
-    Args:
-        num_patches: of the cells, about, from which parts are merged.
-        linked: whether labels of separate regions should agree with those of the cells nearest to them.
-        gap: most empty cells between regions that count as connected: holes of scans cut limbs in two.
-    """
+    """A grid of C cells, and sample points (n, 3) of the surface in it, before they are moved."""
 
     # Patches for each bone, which may then begin and end nearly anywhere.
     PER_BONE: ClassVar[int] = 10
 
     grid: SparseGrid
     points: Tensor
-    num_patches: int = 100
-    linked: bool = False
-    gap: float = 3.0
+    num_patches: int = 100  # of the cells, about, from which parts are merged
+    linked: bool = False  # whether labels of separate regions should agree with those of the cells nearest to them
+    gap: float = 3.0  # most empty cells between regions that count as connected: holes of scans cut limbs in two
 
     @cached_property
     def cell(self) -> Tensor:
@@ -74,18 +68,12 @@ class CellData:
 
 @dataclass(frozen=True)
 class LabelCosts:
-    """Costs of the W-step in addition to the squared residuals, which are a mean per cell, in squared cells.
+    """Costs of the W-step in addition to the squared residuals, which are a mean per cell, in squared cells."""
 
-    Args:
-        smoothness: mu, of two neighboring cells with different labels.
-        label: of each label in use: the number of bones is a cap, not a goal.
-        truncation: largest distance of a sample, in cells; the paper's.
-        seam: nu, of neighboring cells with different labels, per cell of the gap, up to one, that their motions open.
-    """
-
-    smoothness: float
-    label: float
-    truncation: float = math.inf
+    smoothness: float  # mu, of two neighboring cells with different labels
+    label: float  # of each label in use: the number of bones is a cap, not a goal
+    truncation: float = math.inf  # largest distance of a sample, in cells; the paper's
+    # nu, of neighboring cells with different labels, per cell of the gap, up to one, that their motions open
     seam: float = 0.0
 
 
@@ -98,10 +86,7 @@ def labels_of_parts(data: CellData, points: Tensor, parts: Tensor) -> Tensor:
 
 
 def first_labels(data: CellData, moved: Tensor, weights: Tensor, num_bones: int, costs: LabelCosts) -> Tensor:
-    """Return labels (C,) of at most ``num_bones`` parts that move rigidly, in all frames of moved samples (F, n, 3).
-
-    Unlike the paper's random segmentation this one follows the motion; a part must save what a label costs.
-    """
+    """Return labels (C,) of at most ``num_bones`` parts that move rigidly, in all frames of moved samples (F, n, 3)."""
     moments, patches = data.moments(moved, weights), data.patches
     part = merge_rigid(moments, patches[data.bridged], num_bones, tolerance=costs.label / data.per_cell(weights))
     if int(part.max()) >= num_bones:
@@ -120,9 +105,8 @@ def relabel(
     ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, 1)) + h |used labels|``
     with W the squared residuals of the cell's samples under the motion of a bone, in all frames, and x_CD midway
     between two cells. Unlike in the paper, the pairwise term is the discontinuity of the deformation across the border,
-    which thus passes through the joint; it is truncated, as not all parts that touch are joined.
-
-    References: Chang and Zwicker 2009, eq. 11; Delong et al. 2012 for the costs of labels.
+    which thus passes through the joint; it is truncated, as not all parts that touch are joined (Chang and Zwicker
+    2009, eq. 11; Delong et al. 2012 for the costs of labels).
     """
     size, grid = transforms.shape[-3], data.grid
     squares = correspondences.squared_residuals(transform_points(transforms, data.points))
@@ -145,10 +129,7 @@ def relabel(
 
 
 def _seam_positions(data: CellData, transforms: Tensor) -> Tensor:
-    """Return images (A, B, 3 F) of the middles between neighboring cells under motions (F, B, 4, 4), in cells.
-
-    Distances between them are root mean squares over the frames.
-    """
+    """Return images (A, B, 3 F) of the middles between neighboring cells under motions (F, B, 4, 4), in cells."""
     middles = data.grid.cell_centers()[data.neighbors].mean(1)
     images = transform_points(transforms, middles) / (data.grid.spacing * len(transforms) ** 0.5)
     return images.permute(2, 1, 0, 3).flatten(2)

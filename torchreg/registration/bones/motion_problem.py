@@ -20,25 +20,18 @@ from torchreg.solvers.levenberg_marquardt import Linearization
 
 @dataclass(frozen=True)
 class Binding:
-    """Skinning weights (N, B) as a list of E entries: most points follow one or two of many bones.
-
-    Args:
-        point: (E,) int64, of each entry; ``bone`` and ``values`` likewise.
-        first: (Q,) int64, first entry of every pair of entries of one point, an entry with itself included.
-        second: (Q,) int64, second entry of every pair, not before the first.
-        block: (Q,) int64, block of the Hessian that the pair adds to: first bone times B plus second bone.
-    """
+    """Skinning weights (N, B) as a list of E entries: most points follow one or two of many bones."""
 
     # A smaller weight moves a point by less than the noise of any scan.
     LEAST_WEIGHT: ClassVar[float] = 1e-4
 
     weights: Tensor
-    point: Tensor
+    point: Tensor  # (E,) int64, of each entry; ``bone`` and ``values`` likewise
     bone: Tensor
     values: Tensor
-    first: Tensor
-    second: Tensor
-    block: Tensor
+    first: Tensor  # (Q,) int64, first entry of every pair of entries of one point, an entry with itself included
+    second: Tensor  # (Q,) int64, second entry of every pair, not before the first
+    block: Tensor  # (Q,) int64, block of the Hessian that the pair adds to: first bone times B plus second bone
 
     @classmethod
     def from_weights(cls, weights: Tensor) -> Binding:
@@ -93,25 +86,17 @@ class BoneProblem:
     ``E = E_dist + beta sum_{i<j} b_ij tau_ij int w_i w_j |T_i x - T_j x|^2 dx + sum_i a_i E_anchor,i``: the mean
     squared residual, see `ScanDistance`; the joint energy, see `JointEnergy`; and the mean squared distance of each
     bone's body from where its anchor takes it.
-
-    Args:
-        points: (N, 3) before they are moved.
-        bodies: of the bones, which turn about their centers.
-        joint_weight: beta.
-        pair_weights: (..., P) b, of the joints; ones by default.
-        anchors: (..., B, 4, 4) motions to stay near; none by default.
-        anchor_weights: a, one for all bones or (..., B).
     """
 
-    points: Tensor
+    points: Tensor  # (N, 3) before they are moved
     binding: Binding
     correspondences: Correspondences
-    bodies: BoneBodies
+    bodies: BoneBodies  # of the bones, which turn about their centers
     moments: JointMoments = field(default_factory=JointMoments.none)
-    joint_weight: float = 1.0
-    pair_weights: Tensor | None = None
-    anchors: Tensor | None = None
-    anchor_weights: float | Tensor = 0.0
+    joint_weight: float = 1.0  # beta
+    pair_weights: Tensor | None = None  # (..., P) b, of the joints; ones by default
+    anchors: Tensor | None = None  # (..., B, 4, 4) motions to stay near; none by default
+    anchor_weights: float | Tensor = 0.0  # a, one for all bones or (..., B)
     blend: str = "linear"
 
     @classmethod
@@ -147,10 +132,7 @@ class BoneProblem:
         return shifting + nn.functional.pad(turning, (3, 0, 3, 0))
 
     def linearize(self, transforms: Tensor, joints: Tensor | None = None) -> Linearization:
-        """Return half of E, its gradient and Gauss-Newton Hessian by the 6 B twists at motions (..., B, 4, 4).
-
-        Given ``joints`` (P, 3) replace the centers of the moments.
-        """
+        """Return half of E, its gradient and Gauss-Newton Hessian by the 6 B twists at motions (..., B, 4, 4)."""
         transforms = self.batched(transforms)
         equations = _NormalEquations(transforms, self.centers(transforms))
         self._add_correspondences(equations)
@@ -246,20 +228,14 @@ class BoneProblem:
 
 
 class _PairwiseFactors(NamedTuple):
-    """Squared distances between the images of a body under two motions, one factor each.
+    """Squared distances between the images of a body under two motions, one factor each."""
 
-    Args:
-        ends: (2 S,) first motions of the S factors, joints before anchors, then second motions.
-        frames: (2 S, 4, 4) of both ends: homogeneous rows whose squared images under a difference of motions add up to
-            the mean over the body.
-        root: (..., S) of the factors' weights.
-        blocks: of the Hessian: those of every end that moves, then those of the joints' pairs.
-    """
-
-    ends: Tensor
+    ends: Tensor  # (2 S,) first motions of the S factors, joints before anchors, then second motions
+    # (2 S, 4, 4) of both ends: homogeneous rows whose squared images under a difference of motions add up to the mean
+    # over the body
     frames: Tensor
-    root: Tensor
-    blocks: Tensor
+    root: Tensor  # (..., S) of the factors' weights
+    blocks: Tensor  # of the Hessian: those of every end that moves, then those of the joints' pairs
     num_joints: int
 
     def at(self, joints: Tensor) -> _PairwiseFactors:

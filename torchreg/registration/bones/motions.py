@@ -18,17 +18,13 @@ _RULE = DampingRule(trusted=0.5, down=0.25, doubtful=1.0, up=4.0, least=0.0)
 
 @dataclass(frozen=True)
 class TStep:
-    """The numbers of a T-step.
+    """The numbers of a T-step."""
 
-    Args:
-        damping: first weight of the mean squared displacement of the bodies: nothing against the residuals, of which a
-            bone gets one part in B, but enough against rounding where a bone has none.
-        rtol: relative change of the energy below which a step is the last.
-        rounding: units in the last place of the squared size of the bodies by which rounding alone changes the cost.
-    """
-
+    # first weight of the mean squared displacement of the bodies: nothing against the residuals, of which a bone gets
+    # one part in B, but enough against rounding where a bone has none
     damping: float = 1e-4
-    rtol: float = 1e-3
+    rtol: float = 1e-3  # relative change of the energy below which a step is the last
+    # units in the last place of the squared size of the bodies by which rounding alone changes the cost
     rounding: float = 10.0
 
 
@@ -37,19 +33,12 @@ T_STEP = TStep()
 
 @dataclass(frozen=True)
 class BoneFit:
-    """Motions that fit correspondences.
+    """Motions that fit correspondences."""
 
-    Args:
-        transforms: (..., B, 4, 4).
-        energy: (...) at them.
-        num_steps: linear systems solved.
-        converged: (...) whether the last step was within the tolerance.
-    """
-
-    transforms: Tensor
-    energy: Tensor
-    num_steps: int
-    converged: Tensor
+    transforms: Tensor  # (..., B, 4, 4)
+    energy: Tensor  # (...) at them
+    num_steps: int  # linear systems solved
+    converged: Tensor  # (...) whether the last step was within the tolerance
 
 
 @torch.no_grad()
@@ -71,9 +60,7 @@ def fit_bones(
 
     ``rtol``: relative change of a problem's energy below which a step is its last. ``atol``: a problem is done when its
     energy is below the square of this length. ``retract``: motions and twists (..., B, 6) about the bodies' centers to
-    motions; `turn_about` by default.
-
-    References: Chang and Zwicker 2009, eq. 5; Marquardt 1963.
+    motions; `turn_about` by default (Chang and Zwicker 2009, eq. 5; Marquardt 1963).
     """
     transforms = problem.batched(transforms)
     current = problem.linearize(transforms)

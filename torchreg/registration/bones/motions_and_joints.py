@@ -76,21 +76,15 @@ class _State(NamedTuple):
 
 
 class _JointSystem(NamedTuple):
-    """Half the energy around twists of the motions (F, 6 B) and centers (P, 3), whose Hessians are block-diagonal.
+    """Half the energy around twists of the motions (F, 6 B) and centers (P, 3), whose Hessians are block-diagonal."""
 
-    Args:
-        costs: (F,) half the problem's energy.
-        cost: () of all frames, and of the centers.
-        mixed: (F, 6 B, 3 P), the Hessian between both.
-    """
-
-    costs: Tensor
-    cost: Tensor
+    costs: Tensor  # (F,) half the problem's energy
+    cost: Tensor  # () of all frames, and of the centers
     gradient: Tensor
     hessian: Tensor
     center_gradient: Tensor
     center_hessian: Tensor
-    mixed: Tensor
+    mixed: Tensor  # (F, 6 B, 3 P), the Hessian between both
 
 
 def _linearized(problem: BoneProblem, state: _State, regularization: float) -> _JointSystem:

@@ -25,21 +25,15 @@ from torchreg.registration.bones.joint_moments import JointMoments
 
 @dataclass(frozen=True, eq=False)
 class EnergyState:
-    """What the terms of the energy are functions of: points (..., N, 3) before they are moved, and the model's state.
-
-    Args:
-        edges: (E, 2) corners that an edge of a cell joins.
-        label_weights: (K, B) of the labels.
-        known_moments: of what bones share, where they are known already.
-    """
+    """The variables of the terms of the energy: points (..., N, 3) before they are moved, and the model's state."""
 
     model: GridLBS
     transforms: Tensor
     points: Tensor
     correspondences: Correspondences
-    edges: Tensor
-    label_weights: Tensor
-    known_moments: JointMoments | None = None
+    edges: Tensor  # (E, 2) corners that an edge of a cell joins
+    label_weights: Tensor  # (K, B) of the labels
+    known_moments: JointMoments | None = None  # of what bones share, where they are known already
 
     @cached_property
     def moved(self) -> Tensor:

@@ -31,11 +31,7 @@ def grid_patches(grid: SparseGrid, count: int, gap: float = 0.0) -> Tensor:
 
 @torch.no_grad()
 def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, tolerance: float = 0.0) -> Tensor:
-    """Return the part (G,) int64 of each patch after the cheapest neighbors are merged again and again (Ward 1963).
-
-    A merger costs by how much the squared error of one rigid motion for both exceeds that of a motion each. Merging
-    goes on at any cost until ``num_parts`` are left, then while it costs at most ``tolerance``.
-    """
+    """Return the part (G,) int64 of each patch after the cheapest neighbors are merged again and again (Ward 1963)."""
     size = moments.num_groups
     sums = moments.sums.reshape(-1, size, moments.sums.shape[-1]).clone()
     part = torch.arange(size, device=edges.device)

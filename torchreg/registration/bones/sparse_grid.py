@@ -35,15 +35,10 @@ _CUBE_EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b)
 
 
 class GridLocation(NamedTuple):
-    """Cells of points, and trilinear coefficients in them.
+    """Cells of points, and trilinear coefficients in them."""
 
-    Args:
-        cell: (..., N) int64, the cell that holds each point, or the occupied one nearest to it in the grid.
-        coefficients: (..., N, 8) trilinear, of the cell's corners; not negative, rows sum to one.
-    """
-
-    cell: Tensor
-    coefficients: Tensor
+    cell: Tensor  # (..., N) int64, the cell that holds each point, or the occupied one nearest to it in the grid
+    coefficients: Tensor  # (..., N, 8) trilinear, of the cell's corners; not negative, rows sum to one
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,20 +47,13 @@ class SparseGrid:
 
     Grid coordinates ``u = axes^T (x - origin) / spacing`` count cells; cell (i, j, k) is the unit cube from there
     (Chang and Zwicker 2009, section 3).
-
-    Args:
-        cells: (C, 3) int64, different, in the order of their coordinates.
-        shape: numbers of cells of the box around them along the three axes.
-        origin: (3,) corner of the box, float32 or float64.
-        axes: (3, 3) directions of the grid as columns, a rotation.
-        spacing: edge length h of a cell, in the unit of the points.
     """
 
-    cells: Tensor
-    shape: tuple[int, int, int]
-    origin: Tensor
-    axes: Tensor
-    spacing: float
+    cells: Tensor  # (C, 3) int64, different, in the order of their coordinates
+    shape: tuple[int, int, int]  # numbers of cells of the box around them along the three axes
+    origin: Tensor  # (3,) corner of the box, float32 or float64
+    axes: Tensor  # (3, 3) directions of the grid as columns, a rotation
+    spacing: float  # edge length h of a cell, in the unit of the points
 
     @classmethod
     def from_cells(cls, cells: Any, shape: Any, origin: Any, axes: Any, spacing: float) -> SparseGrid:

@@ -158,10 +158,7 @@ def _homogeneous(row: Tensor, column: Tensor, value: Tensor, kept: Tensor) -> _R
 
 
 def _weighted_residuals(offsets: Tensor, correspondences: Correspondences, scale: float) -> Tensor:
-    """Return residuals (..., N, B, m) of which the squared sums are `squared_residuals`, weighted.
-
-    ``offsets``: (..., N, B, 3) of the points, moved by each bone, from their targets.
-    """
+    """Return residuals (..., N, B, m) of which the squared sums are `squared_residuals`, weighted."""
     share, normals = correspondences.point_to_point, correspondences.normals
     weights = correspondences.weights.double().expand(offsets.shape[:-2])
     root = (scale * weights / weights.sum().clamp_min(1e-300)).sqrt()[..., None, None]

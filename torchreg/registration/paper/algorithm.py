@@ -27,24 +27,7 @@ from torchreg.registration.results import RegisterRecord
 
 
 class PaperFit:
-    """A registration under way, in units of the source's diagonal.
-
-    Args:
-        data: the grid and the samples in it.
-        source: the scan to be moved.
-        index: (n,) of its points that are matched.
-        target: the scan to be reached.
-        config: what the printed algorithm shares with the default one.
-        paper: what it does not share.
-        num_bones: B, also of the first segmentation.
-        generator: draws seeds, samples and halves; None draws the same at every call.
-        on_step: called with a `RegisterRecord` after each round.
-
-    Attributes:
-        labels: (C,) bone of each cell, from 0 without gaps.
-        model: the bones and weights, one pose.
-        history: records so far.
-    """
+    """A registration under way, in units of the source's diagonal; ``labels`` (C,) are bones of cells, without gaps."""
 
     def __init__(
         self,

@@ -14,8 +14,6 @@ _CANDIDATES_PER_SEED = 10
 def best_candidates(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return indices (count,) of points (N, 3) drawn at random but far apart: each the best of several candidates.
 
-    The best candidate is the one farthest from the seeds before it; of fewer points than ``count``, some come twice.
-
     References: Mitchell 1991, "Spectrally optimal sampling for distribution ray tracing".
     """
     chosen = torch.randint(len(points), (1,), generator=generator)
@@ -35,8 +33,6 @@ def reuse_labels(
     data: CellData, squares: Tensor, labels: Tensor, num_bones: int, *, least_error: float, generator: torch.Generator
 ) -> Tensor:
     """Return labels (C,) in which unused labels take over random halves of the regions with the largest errors.
-
-    ``least_error``: root mean squared residual of a region below which it stays whole.
 
     References: Chang and Zwicker 2009, section 4.2, "Reusing Labels".
     """

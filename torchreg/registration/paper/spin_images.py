@@ -40,17 +40,8 @@ def spin_images(
     """Return how much of a scan lies at each radius and height of the cylinders around oriented points.
 
     A scan point x seen from the point p with normal n has the radius ``alpha = sqrt(|x - p|^2 - (n . (x - p))^2)`` and
-    the height ``beta = n . (x - p)``; it counts if its own normal is less than the support angle from n.
-
-    Convention: row i holds heights around ``(image_size / 2 - i - 1 / 2) bin_size``, from top to bottom; column j holds
-    radii around ``(j + 1 / 2) bin_size``. With interpolation a point is shared between the four nearest bins; what
-    falls beyond the axis goes to the first column, what falls beyond the other rims is lost.
-
-    ``scan_points``: (M, 3) what is seen: all of a scan, or points spread evenly over it. ``scan_normals``: (M, 3) unit
-    vectors; None counts every point, whatever its side. ``support_angle``: see above, radians; pi counts every point
-    that has a normal. ``weights``: (M,) not negative, how much surface each scan point stands for; ones by default.
-
-    References: Johnson 1997, "Spin-images: a representation for 3-D surface matching", chapter 2.
+    the height ``beta = n . (x - p)``; it counts if its own normal is less than the support angle from n (Johnson 1997,
+    "Spin-images: a representation for 3-D surface matching", chapter 2).
     """
     inputs = {"points": points, "normals": normals, "scan_points": scan_points, "scan_normals": scan_normals}
     tensors = {name: as_float_tensor(value, name) for name, value in inputs.items() if value is not None}
@@ -140,12 +131,6 @@ def image_similarity(
     source: Tensor, target: Tensor, similarity: str = "correlation", *, overlap: float = 3.0
 ) -> Tensor:
     """Return how alike any two images are, larger for more.
-
-    - "correlation": Pearson's coefficient r over all bins, -1 to 1; zero for images without contrast.
-    - "overlap": ``sign(r) atanh(r)^2 - overlap / (N - 3)``, with r over the N bins in which both images see something:
-      what one scan hides does not count, but little overlap is held against a pair (minus infinity below 4 bins).
-    - "l2": minus the Euclidean distance of the images scaled to unit length, 0 at most.
-    - "distance": minus the Euclidean distance of the descriptors as they are, 0 at most.
 
     References: Johnson 1997, section 2.4 for "overlap", his similarity measure C.
     """

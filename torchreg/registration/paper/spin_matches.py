@@ -18,21 +18,13 @@ _SCENE_SPACING = 0.5
 
 @dataclass(frozen=True)
 class RegionMatches:
-    """Correspondences of n source points, and the rigid motion of each region.
+    """Correspondences of n source points, and the rigid motion of each region."""
 
-    Args:
-        targets: (n, 3).
-        normals: (n, 3) unit normals there.
-        kept: (n,) True for inliers of the motion of their region.
-        candidates: (n,) True for points that found any target within reach.
-        motions: (B, 4, 4); the identity where a region has too few inliers.
-    """
-
-    targets: Tensor
-    normals: Tensor
-    kept: Tensor
-    candidates: Tensor
-    motions: Tensor
+    targets: Tensor  # (n, 3)
+    normals: Tensor  # (n, 3) unit normals there
+    kept: Tensor  # (n,) True for inliers of the motion of their region
+    candidates: Tensor  # (n,) True for points that found any target within reach
+    motions: Tensor  # (B, 4, 4); the identity where a region has too few inliers
 
 
 def spin_matches(

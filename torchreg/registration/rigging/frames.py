@@ -31,23 +31,14 @@ _LIMITS = _Limits()
 
 @dataclass(frozen=True)
 class RigFrames:
-    """Frames that are used, with their numbers in the sequence.
+    """Frames that are used, with their numbers in the sequence."""
 
-    Args:
-        scans: coarse, double precision.
-        surfaces: even samples of each, from which distances are measured.
-        numbers: of the scans among all frames.
-        template: index among the scans.
-        mesh: of the template, as it was given.
-        notes: one sentence for each frame that is left out.
-    """
-
-    scans: tuple[RangeScan, ...]
-    surfaces: tuple[SurfaceSamples, ...]
-    numbers: tuple[int, ...]
-    template: int
-    mesh: TriangleMesh
-    notes: tuple[str, ...]
+    scans: tuple[RangeScan, ...]  # coarse, double precision
+    surfaces: tuple[SurfaceSamples, ...]  # even samples of each, from which distances are measured
+    numbers: tuple[int, ...]  # of the scans among all frames
+    template: int  # index among the scans
+    mesh: TriangleMesh  # of the template, as it was given
+    notes: tuple[str, ...]  # one sentence for each frame that is left out
 
 
 def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) -> RigFrames:

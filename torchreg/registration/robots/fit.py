@@ -27,19 +27,12 @@ FIT = FitNumbers()
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """Links on a tree of joints, and their values in T frames, in the coordinates of the reference.
+    """Links on a tree of joints, and their values in T frames, in the coordinates of the reference."""
 
-    Args:
-        parents: (K,) of each link; -1 for the root, which comes first; parents come before children.
-        axes: (K, 6) twists of the joints about which links move, unit turns or slides; zero for the root.
-        base: (T, 4, 4) motions of the root.
-        values: (T, K), radians or lengths; zero for the root.
-    """
-
-    parents: Sequence[int]
-    axes: Tensor
-    base: Tensor
-    values: Tensor
+    parents: Sequence[int]  # (K,) of each link; -1 for the root, which comes first; parents come before children
+    axes: Tensor  # (K, 6) twists of the joints about which links move, unit turns or slides; zero for the root
+    base: Tensor  # (T, 4, 4) motions of the root
+    values: Tensor  # (T, K), radians or lengths; zero for the root
 
     def motions(self) -> Tensor:
         """Return the motions (T, K, 4, 4) of all links."""
@@ -55,10 +48,7 @@ class Mechanism:
         return replace(self, base=se3_exp(base) @ self.base, values=self.values + values, axes=moved)
 
     def jacobians(self, motions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the links' twists by the joint values (T, K, 6, K) and by steps of the axes (T, K, 6, K, 6).
-
-        Twists are those of motions from the left, about the origin; the base's are the links' own.
-        """
+        """Return the links' twists by the joint values (T, K, 6, K) and by steps of the axes (T, K, 6, K, 6)."""
         frames, size = self.values.shape
         by_value = torch.zeros(frames, size, 6, size, dtype=torch.float64)
         by_axis = torch.zeros(frames, size, 6, size, 6, dtype=torch.float64)
@@ -85,11 +75,7 @@ def fitted(
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Gauss-Newton system of all frames: steps of each frame, D = 6 + K numbers, and of the axes, 6 K in all.
-
-    ``local`` (T, D, D) and its gradient (T, D), ``mixed`` (T, D, 6 K), ``outer`` (6 K, 6 K) and its gradient (6 K,),
-    and ``hold`` (6 K,), a trace of damping for directions that move no joint.
-    """
+    """Gauss-Newton system of all frames: steps of each frame, D = 6 + K numbers, and of the axes, 6 K in all."""
 
     local: Tensor
     local_gradient: Tensor
@@ -143,11 +129,7 @@ def _step(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float,
 def axis_stds(
     surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3).
-
-    Those in the worst direction across the axis, all other unknowns marginalized; zero for the root, and a slider's
-    axis lies nowhere.
-    """
+    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
     _, reduced = _System.of(surfaces, mechanism, label, FIT.scales[-1] * noise.sigma).eliminated()
     size = len(points)
     everything = noise.sigma**2 * noise.repeats * torch.linalg.pinv(reduced, hermitian=True)
@@ -170,10 +152,7 @@ def settled(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Nois
 
 
 def _from_neighbors(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> Mechanism:
-    """Return the mechanism with each frame's pose that of least cost: its own, or one found from a frame beside it.
-
-    A frame that registration got wrong is reached from its neighbors by ICP whose kernel narrows.
-    """
+    """Return the mechanism with each frame's pose that of least cost: its own, or one found from a frame beside it."""
     scales = [share * surfaces.size for share in FIT.wide] + [scale * noise.sigma for scale in FIT.scales[2:]]
     kernel = FIT.scales[0] * noise.sigma
     best, cost = mechanism, surfaces.cost(mechanism.motions(), label, kernel)

@@ -28,38 +28,23 @@ JOINTS = JointNumbers()
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """The best joint between two links, in the coordinates of the reference.
+    """The best joint between two links, in the coordinates of the reference."""
 
-    Args:
-        kind: "fixed", "revolute" or "prismatic".
-        twist: (6,) of a unit turn or slide; zero for a weld.
-        values: (T,) of the joint.
-        length: its description length minus that of a free motion: below zero, the data speak for the joint.
-    """
-
-    kind: str
-    twist: Tensor
-    values: Tensor
-    length: float
+    kind: str  # "fixed", "revolute" or "prismatic"
+    twist: Tensor  # (6,) of a unit turn or slide; zero for a weld
+    values: Tensor  # (T,) of the joint
+    length: float  # its description length minus that of a free motion: below zero, the data speak for the joint
 
 
 @dataclass(frozen=True, eq=False)
 class Relative:
-    """Motions (T, 4, 4) of one link seen from another, in units in which the thing's half size is 1, and their weights.
+    """Motions (T, 4, 4) of one link relative to another, in half sizes of the thing, and their weights."""
 
-    Args:
-        motions: about the origin ``center``.
-        information: (T, 6, 6) inverse covariances of their errors, twists in the frame of the first link.
-        count: effective number of residuals behind them.
-        center: (3,) between the two links.
-        unit: length.
-    """
-
-    motions: Tensor
-    information: Tensor
-    count: float
-    center: Tensor
-    unit: float
+    motions: Tensor  # about the origin ``center``
+    information: Tensor  # (T, 6, 6) inverse covariances of their errors, twists in the frame of the first link
+    count: float  # effective number of residuals behind them
+    center: Tensor  # (3,) between the two links
+    unit: float  # length
 
 
 def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Noise, size: float) -> Relative:
@@ -89,12 +74,7 @@ def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Nois
 
 
 def best_joint(data: Relative) -> Candidate:
-    """Return the joint of least description length: squared errors in standard deviations, and parameters.
-
-    A joint's cost is the least Mahalanobis distance of the motions from its one-parameter family; with the logarithm of
-    the number of residuals for each parameter this is twice the negative logarithm of its evidence (Schwarz 1978). A
-    free motion has six parameters a frame and no error.
-    """
+    """Return the joint of least description length: squared errors in standard deviations, and parameters."""
     frames, rate = len(data.motions), math.log(data.count)
     twists = se3_log(data.motions)
     weld = float((twists.unsqueeze(-2) @ data.information @ twists.unsqueeze(-1)).sum())

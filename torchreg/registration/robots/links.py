@@ -29,11 +29,10 @@ LINKS = LinkNumbers()
 def labeled(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, free: float) -> Tensor:
     """Return the labels (n,) of least description length under given motions (T, K, 4, 4).
 
-    A sample costs half its squared residual in standard deviations, up to that of an outlier, summed over the frames;
-    a border between neighbors costs what its rarity tells (`border_cost`); a label that is used costs its parameters,
-    half the logarithm of the number of residuals each. Samples that err together count once.
-
-    References: Isack and Boykov 2012 (PEARL); Delong et al. 2012; Schwarz 1978 for the cost of parameters.
+    A sample costs half its squared residual in standard deviations, up to that of an outlier, summed over the frames; a
+    border between neighbors costs what its rarity tells (`border_cost`); a label that is used costs its parameters,
+    half the logarithm of the number of residuals each. Samples that err together count once (Isack and Boykov 2012
+    (PEARL); Delong et al. 2012; Schwarz 1978 for the cost of parameters).
     """
     squares = surfaces.squares(motions, NUMBERS.cut * noise.sigma) / noise.sigma**2
     unary = 0.5 * squares.clamp_max(NUMBERS.cut**2).sum(0) / noise.repeats

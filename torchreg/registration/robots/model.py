@@ -43,28 +43,17 @@ MODEL = ModelNumbers()
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A robot found in scans: its joints, and how they stood in every frame.
+    """A robot found in scans: its joints, and their values in every frame; links that never parted are one."""
 
-    Args:
-        tree: one frame a link, the zero pose that of the reference.
-        part: (N,) link of each point of the reference.
-        joint_values: (T, J) radians, or the scans' unit.
-        base: (T, 4, 4) motions of the root link from the reference.
-        residuals: (T,) median distances of the reference, moved by the joints, from the scans; zero for the reference.
-        loose: names of the joints whose links move in more ways about each other than one joint allows.
-        axis_std: (J,) standard deviations of the joints' axes, radians, where the links are right.
-        origin_std: (J,) the same of where a hinge's axis lies, at its link's origin, in the scans' unit.
-
-    Joints that never moved are none: their links are one.
-    """
-
-    tree: KinematicTree
-    part: Tensor
-    joint_values: Tensor
-    base: Tensor
+    tree: KinematicTree  # one frame a link, the zero pose that of the reference
+    part: Tensor  # (N,) link of each point of the reference
+    joint_values: Tensor  # (T, J) radians, or the scans' unit
+    base: Tensor  # (T, 4, 4) motions of the root link from the reference
+    # (T,) median distances of the reference, moved by the joints, from the scans; zero for the reference
     residuals: Tensor
-    axis_std: Tensor
-    origin_std: Tensor
+    axis_std: Tensor  # (J,) standard deviations of the joints' axes, radians, where the links are right
+    origin_std: Tensor  # (J,) the same of where a hinge's axis lies, at its link's origin, in the scans' unit
+    # names of the joints whose links move in more ways about each other than one joint allows
     loose: tuple[str, ...] = ()
 
     @property
@@ -109,10 +98,8 @@ def find_robot(
     motions; those that hold together are one. The joints of most evidence make a tree, whose axes and values are fitted
     to all scans together; links and joints are then looked for once more from there.
 
-    ``part``: (N,) labels of bones, at least as many as links that registration tells apart.
-
-    References: Isack and Boykov 2012 for the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most
-    evidence.
+    ``part``: (N,) labels of bones, at least as many as links that registration tells apart (Isack and Boykov 2012 for
+    the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most evidence).
     """
     points, normals, deformed = (values.detach().cpu().double() for values in (points, normals, deformed))
     part = part.cpu().unique(return_inverse=True)[1]
@@ -169,12 +156,7 @@ def without_welds(
 def assembled(
     surfaces: Surfaces, motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate]
 ) -> tuple[Mechanism, Tensor]:
-    """Return the tree of the joints of most evidence, and the labels by its links.
-
-    The root is the link that moves least: that of an arm stands still.
-
-    ``motions``: (T, K, 4, 4) of links that all touch another, if there are two.
-    """
+    """Return the tree of the joints of most evidence, and the labels by its links."""
     count, frames = motions.shape[1], len(motions)
     pairs = torch.tensor(list(joints), dtype=torch.long).reshape(-1, 2)
     lengths = torch.tensor([joint.length for joint in joints.values()], dtype=torch.float64)
@@ -267,11 +249,7 @@ def write_robot(
     faces: Tensor | None,
     scans: Sequence[Target] | None = None,
 ) -> None:
-    """Write a robot as URDF, each link with a mesh in a frame that begins at its joint.
-
-    That mesh is the link's triangles in the reference; without triangles, a closed surface about the points that all
-    scans show of the link.
-    """
+    """Write a robot as URDF, each link with a mesh in a frame that begins at its joint."""
     points = points.detach().cpu().double()
     if faces is not None:
         faces = faces.cpu()

@@ -31,12 +31,7 @@ NUMBERS = SurfaceNumbers()
 
 
 class Target:
-    """A scan to be compared with.
-
-    Args:
-        points: (M, 3).
-        normals: (M, 3).
-    """
+    """A scan to be compared with."""
 
     def __init__(self, points: Tensor, normals: Tensor) -> None:
         self.points, self.normals = points, normals
@@ -62,53 +57,32 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Of residuals.
+    """Of residuals."""
 
-    Args:
-        sigma: standard deviation, unit of length.
-        repeats: how many samples tell as much as one that erred by itself (the design effect of survey statistics).
-    """
-
-    sigma: float
-    repeats: float
+    sigma: float  # standard deviation, unit of length
+    repeats: float  # how many samples tell as much as one that erred by itself (the design effect of survey statistics)
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Normal equations of the motions of K parts in T frames: ``0.5 d' H d + g' d``, d the twist about the centers.
+    """Normal equations of the motions of K parts in T frames: ``0.5 d' H d + g' d``, d the twist about the centers."""
 
-    Args:
-        hessian: (T, K, 6, 6).
-        gradient: (T, K, 6).
-        centers: (T, K, 3).
-        count: (T, K) samples that count.
-    """
-
-    hessian: Tensor
-    gradient: Tensor
-    centers: Tensor
-    count: Tensor
+    hessian: Tensor  # (T, K, 6, 6)
+    gradient: Tensor  # (T, K, 6)
+    centers: Tensor  # (T, K, 3)
+    count: Tensor  # (T, K) samples that count
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Samples of the reference, and the scans of the other frames.
+    """Samples of the reference, and the scans of the other frames."""
 
-    Args:
-        samples: (n, 3), every beginning of which covers the surface evenly.
-        normals: (n, 3).
-        edges: (E, 2) pairs of neighbors, which connect all samples.
-        patch: (n,) patch of each sample.
-        targets: T scans.
-        size: diagonal of the samples.
-    """
-
-    samples: Tensor
-    normals: Tensor
-    edges: Tensor
-    patch: Tensor
-    targets: tuple[Target, ...]
-    size: float
+    samples: Tensor  # (n, 3), every beginning of which covers the surface evenly
+    normals: Tensor  # (n, 3)
+    edges: Tensor  # (E, 2) pairs of neighbors, which connect all samples
+    patch: Tensor  # (n,) patch of each sample
+    targets: tuple[Target, ...]  # T scans
+    size: float  # diagonal of the samples
 
     @classmethod
     def of(cls, samples: Tensor, normals: Tensor, targets: Sequence[Target]) -> Surfaces:

@@ -33,11 +33,7 @@ def skeletonize_frames(
     on_step: Callable[[SpineRecord], None] | None = None,
     progress: str | os.PathLike[str] | None = None,
 ) -> list[FrameSkeleton]:
-    """Return the skeleton of every frame, and the relations of its tips along the surface.
-
-    ``on_step`` is called with every frame as it is done; ``progress`` is a folder that keeps skeletons for later calls
-    with the same surface and configuration.
-    """
+    """Return the skeleton of every frame, and the relations of its tips along the surface."""
     skeletons: dict[int, FrameSkeleton] = {}
     kept = KeptResults.in_folder(progress)
 

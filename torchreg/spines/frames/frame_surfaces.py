@@ -88,23 +88,15 @@ def _from_tensors(tensors: Mapping[str, Tensor], notes: Sequence[str]) -> _Surfa
 
 @dataclass(frozen=True, eq=False)
 class FrameSurfaces(Sequence[TriangleMesh]):
-    """The surfaces of frames.
+    """The surfaces of frames."""
 
-    Meshes are read from their sequence on request and are not kept; the surfaces of clouds, which are expensive, are.
-
-    Args:
-        frames: meshes, or points without faces; any sequence.
-        made: the surfaces of clouds by the number of the frame.
-        samples: some vertices of each frame, for its size and position.
-        supports: what meshes stand on, which is cut off, by the number of the frame.
-    """
-
-    frames: Sequence[Any]
+    frames: Sequence[Any]  # meshes, or points without faces; any sequence
     names: tuple[str, ...]
-    made: dict[int, TriangleMesh]
+    made: dict[int, TriangleMesh]  # the surfaces of clouds by the number of the frame
     notes: tuple[tuple[str, ...], ...]
-    samples: tuple[Tensor, ...]
+    samples: tuple[Tensor, ...]  # some vertices of each frame, for its size and position
     shift: Tensor | None = None
+    # what meshes stand on, which is cut off, by the number of the frame
     supports: Mapping[int, SupportSplit] = field(default_factory=dict)
 
     @classmethod
@@ -117,10 +109,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         progress: str | os.PathLike[str] | None = None,
         support: str = "auto",
     ) -> FrameSurfaces:
-        """Return the surfaces of frames, read one by one; errors name the frame.
-
-        ``progress`` is a folder that keeps the surfaces of clouds for later calls; for ``support`` see `split_support`.
-        """
+        """Return the surfaces of frames, read one by one; errors name the frame."""
         check_choice(support, "support", SUPPORTS)
         if isinstance(frames, TriangleMesh):
             raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")

@@ -44,11 +44,7 @@ class Job(Generic[_Found]):
 
 
 def do_jobs(next_job: Callable[[], Job[Any] | None], num_frames: int, workers: int | None) -> None:
-    """Do jobs, and call `Job.done` with each result in the order in which they come.
-
-    ``next_job`` is asked when a process is idle, and returns None if there is no job before others are done. Few jobs
-    are all done in this process, as where processes cannot be forked; by default there is one per core.
-    """
+    """Do jobs, and call `Job.done` with each result in the order in which they come."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min(cores if workers is None else workers, num_frames)
     can_fork = "fork" in multiprocessing.get_all_start_methods() and not multiprocessing.current_process().daemon

@@ -19,28 +19,18 @@ from torchreg.spines.limbs.observed_limbs import observe_limbs
 
 @dataclass(frozen=True, eq=False)
 class GrowingLimbs:
-    """The L limbs of a growing thing in T frames.
+    """The L limbs of a growing thing in T frames."""
 
-    Args:
-        curves: (T, L, S, 3), without length where the limb does not exist.
-        observed: (T, L) True where the frame's own skeleton has the limb.
-    """
-
-    curves: Tensor
+    curves: Tensor  # (T, L, S, 3), without length where the limb does not exist
     radii: Tensor
-    observed: Tensor
+    observed: Tensor  # (T, L) True where the frame's own skeleton has the limb
     present: Tensor
 
 
 def growing_limbs(
     skeletons: Sequence[Skeleton], tracks: OrganTracks, graph: LimbGraph, num_samples: int
 ) -> GrowingLimbs:
-    """Return the limbs of a graph of all organs in all frames.
-
-    A path between two organs is cut where others grow out of it in other frames, at the shares of lengths in the
-    nearest frame that shows these. A hidden limb is interpolated in time; one that does not exist has no length, and
-    lies where it will grow or has grown.
-    """
+    """Return the limbs of a graph of all organs in all frames."""
     whole = [
         _shown_limbs(skeleton, row, graph, num_samples) for skeleton, row in zip(skeletons, tracks.labels, strict=True)
     ]
@@ -126,10 +116,7 @@ def _over_time(values: Tensor) -> Tensor:
 
 
 def _joined(curves: Tensor, observed: Tensor, present: Tensor, graph: LimbGraph) -> Tensor:
-    """Return curves (T, L, S, 3) that meet in the nodes of a graph; those that are not present have no length.
-
-    A node lies where observed limbs have it, else where interpolated ones do.
-    """
+    """Return curves (T, L, S, 3) that meet in the nodes of a graph; those that are not present have no length."""
     nodes = _over_time(_node_positions(curves, observed, graph))
     guessed = _over_time(_node_positions(curves, present, graph))
     nodes = torch.where(nodes.isnan(), guessed, nodes)

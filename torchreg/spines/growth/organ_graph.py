@@ -79,11 +79,7 @@ def shown_tree(skeleton: Skeleton, labels: Sequence[int]) -> ShownTree:
 
 
 def common_graph(shown: Sequence[ShownTree], num_organs: int) -> LimbGraph:
-    """Return the tree of all K organs, two or more, from the trees of T frames.
-
-    It begins as the most frequent tree of the largest number of organs shown together; others are added, those shown
-    with most first, at the position of least Robinson-Foulds distance (1981) over the organs of each frame.
-    """
+    """Return the tree of all K organs, two or more, from the trees of T frames."""
     counts = Counter(shown)
     most = max(counts, key=lambda row: (len(row[0]), counts[row], sorted(row[0])))[0]
     tree = _Tree.from_splits(most, most_frequent_splits([splits for organs, splits in shown if organs == most]))

@@ -39,15 +39,11 @@ LIFE = OrganLife()
 
 @dataclass(frozen=True, eq=False)
 class OrganTracks:
-    """The K organs of T frames, in the order in which they appear.
+    """The K organs of T frames, in the order in which they appear."""
 
-    Args:
-        labels: (T, K) index of each organ's tip in its frame, -1 where the frame lacks it.
-        confidence: (T, K) probability that this is what became of its last tip; where the frame lacks it, that of the
-            next one; NaN before its birth and after its end.
-    """
-
-    labels: Tensor
+    labels: Tensor  # (T, K) index of each organ's tip in its frame, -1 where the frame lacks it
+    # (T, K) probability that this is what became of its last tip; where the frame lacks it, that of the next one; NaN
+    # before its birth and after its end
     confidence: Tensor
     births: Tensor
     ends: Tensor
@@ -125,11 +121,7 @@ class _Search:
         return torch.stack([(_steps(target) - _steps(rows)).square().sum(-1) for rows in ways])
 
     def _first_motion(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return the motion (4, 4) of the body between two frames with tips (n,) and (m,) of unknown names.
-
-        Of the motions that take two of the surest tips to two others, and of none, it brings all tips nearest, by a
-        small rotation.
-        """
+        """Return the motion (4, 4) of the body between two frames with tips (n,) and (m,) of unknown names."""
         salient = [tips[self.graph.real[tips].argsort(descending=True, stable=True)[: LIFE.num_salient]]
                    for tips in (before, after)]  # fmt: skip
         guesses = torch.cat((torch.eye(4, dtype=torch.float64)[None], self._guesses(*salient)))

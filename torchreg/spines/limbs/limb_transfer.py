@@ -44,11 +44,7 @@ def transfer_missing_limbs(
     workers: int | None = None,
     progress: str | os.PathLike[str] | None = None,
 ) -> list[FrameLimbs]:
-    """Return the frames with all limbs: those that a frame lacks are transferred from the frames around it.
-
-    A limb moves with the observed ones, and then inside the body to its own depth; between two frames that show it,
-    both transfers are interpolated in time. The sides of a gap, and all gaps, are worked on in parallel.
-    """
+    """Return the frames with all limbs: those that a frame lacks are transferred from the frames around it."""
     chains = _Chains(frames, graph, meshes, KeptResults.in_folder(progress))
     do_jobs(chains.next_job, len(chains.missing), 1 if meshes[0].vertices.is_cuda else workers)
     return [chains.limbs(number) for number in range(len(frames))]
@@ -155,11 +151,7 @@ class _Target:
 def complete_from_prior(
     frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], prior: FrameLimbs, reference: int
 ) -> list[FrameLimbs]:
-    """Return the frames; if none shows all limbs, the one that shows most gets the others from a prior skeleton.
-
-    The prior's limbs are moved rigidly with those that are shown, and then inside. Of several such frames the nearest
-    to ``reference`` is taken.
-    """
+    """Return the frames; if none shows all limbs, the one that shows most gets the others from a prior skeleton."""
     if any(bool(frame.observed.all()) for frame in frames):
         return list(frames)
     counts = [int(frame.observed.sum()) for frame in frames]

@@ -49,9 +49,8 @@ def transfer_nodes(
 
     Surface point x_i belongs to the node n(i) whose ball is nearest. ``T_p = argmin sum_i w_i(p) |T x_i - y_i|^2``,
     ``w_i(p) = exp(-d(p, n(i))^2 / 2 width^2)``, with path lengths d along the skeleton and y_i the target point nearest
-    to ``T_n(i) x_i``, if normals agree. Known nodes (N, 3), NaN where unknown, are fitted, but not held.
-
-    References: Besl and McKay 1992; Sumner, Schmid and Pauly 2007 for deformations held by nodes.
+    to ``T_n(i) x_i``, if normals agree. Known nodes (N, 3), NaN where unknown, are fitted, but not held (Besl and McKay
+    1992; Sumner, Schmid and Pauly 2007 for deformations held by nodes).
     """
     holder = (torch.cdist(source.points, nodes) - radii).argmin(-1)
     fixed = (~known.isnan().any(-1)).nonzero()[:, 0]

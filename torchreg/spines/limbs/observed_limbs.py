@@ -32,18 +32,12 @@ _LIMITS = LimbLimits()
 
 @dataclass(frozen=True, eq=False)
 class FrameLimbs:
-    """The limbs of a graph in one frame.
+    """The limbs of a graph in one frame."""
 
-    Args:
-        curves: (L, S, 3) in the order and direction of `LimbGraph.edges`.
-        observed: (L,) True where the frame's own skeleton has the limb; others are unknown or were transferred.
-        node_observed: (N,) the same of the nodes of the graph.
-    """
-
-    curves: Tensor
+    curves: Tensor  # (L, S, 3) in the order and direction of `LimbGraph.edges`
     radii: Tensor
-    observed: Tensor
-    node_observed: Tensor
+    observed: Tensor  # (L,) True where the frame's own skeleton has the limb; others are unknown or were transferred
+    node_observed: Tensor  # (N,) the same of the nodes of the graph
     nodes: Tensor
 
 

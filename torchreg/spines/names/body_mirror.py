@@ -27,10 +27,7 @@ SEARCH = SymmetrySearch()
 
 @dataclass(frozen=True, eq=False)
 class BodyMirror:
-    """A mirror symmetry of a body: the mirror image of each name (K,), and of each feature (n,) with its sign.
-
-    ``levels`` (G,) are variances of groups of features from asymmetric poses, in those of random names.
-    """
+    """A mirror symmetry of a body: the mirror image of each name (K,), and of each feature (n,) with its sign."""
 
     names: Tensor
     columns: Tensor
@@ -45,12 +42,7 @@ class BodyMirror:
 def find_mirror(
     kinds: TipFeatures, background: GroupedDensity, frames: Sequence[TipObservations], names: Tensor
 ) -> BodyMirror | None:
-    """Return the mirror symmetry of a body; None if none is certain.
-
-    Geodesic distances are the same in a mirror, volumes change sign, limbs of a pair change places. The difference of
-    body and image is drawn from a normal density of unknown scale in each group of features, or, if it is no mirror,
-    from that of random names (``background``). The frame with the most symmetric pose decides.
-    """
+    """Return the mirror symmetry of a body; None if none is certain."""
     count, (least, most) = kinds.num_names, SEARCH.num_tips
     # Of frames that show all tips: one without a name has the name that is missing.
     complete = [row for row in range(len(frames)) if len(frames[row]) == count and int((names[row] < 0).sum()) < 2]

@@ -115,10 +115,7 @@ class _Round:
         return torch.where(names >= 0, assign(costs)[names.clamp_min(0)], -1)
 
     def _neighborhood(self, near: int, number: int, known: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
-        """Return names (P, K) of a frame within two exchanges of the seeds, and the most probable ones (K,).
-
-        They are the best ones after those (K,) of the frame near it, and the best ones of the frame by itself.
-        """
+        """Return names (P, K) of a frame within two exchanges of the seeds, and the most probable ones (K,)."""
         frame, maps = self.frames[number], seeds
         before = self.model.of_names(self.frames[near], known[None])
         for kept in (SEARCH.num_kept, SEARCH.num_candidates // 2):

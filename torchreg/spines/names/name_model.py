@@ -49,33 +49,20 @@ class NameModel:
     A frame's features are those of the frame before, and as far as they do not correlate, those of a mean frame; both
     up to multivariate t-distributed errors. The points of each limb stay, or move rigidly with the whole body, up to
     t-distributed displacements. Tips without a name, and features and positions under wrong names, are background.
-
-    Args:
-        features: that are compared.
-        mean: (n,) features of a mean frame, NaN where unknown.
-        density: of their errors.
-        background_mean: (n,) under random names.
-        background: density of features under random names.
-        correlation: (G,) of errors between two frames, of each group of features.
-        median_distances: (K (K - 1) / 2,) median distances between named tips.
-        displacement: (S,) scale of the displacements of a limb's points.
-        turn: mean of 1 - cos of the body's rotation between two frames.
-        log_volume: of the space that limbs move in.
-        weight: of features against motion: one, but before anything is known of them.
-        mirror: symmetry of the body, if it has one; a limb and its mirror image then differ by the pose alone.
     """
 
-    features: TipFeatures
-    mean: Tensor
-    density: GroupedDensity
-    background_mean: Tensor
-    background: GroupedDensity
-    correlation: Tensor
-    median_distances: Tensor
-    displacement: Tensor
-    turn: float
-    log_volume: float
-    weight: float = 1.0
+    features: TipFeatures  # that are compared
+    mean: Tensor  # (n,) features of a mean frame, NaN where unknown
+    density: GroupedDensity  # of their errors
+    background_mean: Tensor  # (n,) under random names
+    background: GroupedDensity  # density of features under random names
+    correlation: Tensor  # (G,) of errors between two frames, of each group of features
+    median_distances: Tensor  # (K (K - 1) / 2,) median distances between named tips
+    displacement: Tensor  # (S,) scale of the displacements of a limb's points
+    turn: float  # mean of 1 - cos of the body's rotation between two frames
+    log_volume: float  # of the space that limbs move in
+    weight: float = 1.0  # of features against motion: one, but before anything is known of them
+    # symmetry of the body, if it has one; a limb and its mirror image then differ by the pose alone
     mirror: BodyMirror | None = None
 
     @classmethod
@@ -152,10 +139,7 @@ class NameModel:
         return self.background(torch.where(self.mean.isnan(), torch.nan, features) - self.background_mean)
 
     def motion_scores(self, before: TipObservations, after: TipObservations, tips: Tensor) -> Tensor:
-        """Return log-probabilities (P,) of limb positions for tips (P, M) that those before become, -1 for none.
-
-        The rigid motion of the body is fitted to each mapping, see `rank_mappings`.
-        """
+        """Return log-probabilities (P,) of limb positions for tips (P, M) that those before become, -1 for none."""
         found = (tips >= 0).to(before.curves)
         moved, turn = self._moved(before.curves, after.curves[tips.clamp_min(0)], found)
         still = (after.curves[tips.clamp_min(0)] - before.curves).square().sum(-1)

@@ -76,10 +76,7 @@ SHRINKAGE = Shrinkage()
 
 
 def fit_groups(samples: Tensor, background: GroupedDensity) -> tuple[Tensor, GroupedDensity]:
-    """Return the means (n,) of samples (T, n) and the density around them; of a single sample nothing is known, NaN.
-
-    Weights by Lange, Little and Taylor 1989; covariances shrunk to the background's shape as by Ledoit and Wolf 2004.
-    """
+    """Return the means (n,) of samples (T, n) and the density around them; of a single sample nothing is known, NaN."""
     samples = torch.where((~samples.isnan()).sum(0) > 1, samples, torch.nan)
     mean, covariances = samples.nanmedian(0).values, []
     for group, wide in zip(background.groups, background.covariances, strict=True):

@@ -31,17 +31,12 @@ SAMPLING = TipSampling()
 
 @dataclass(frozen=True, eq=False)
 class TipObservations:
-    """Measurements of the M tips of a frame, lengths in sizes of the body, float64.
+    """Measurements of the M tips of a frame, lengths in sizes of the body, float64."""
 
-    Args:
-        curves: (M, S, 3) points of the limbs, from the tips towards the middle of the body.
-        limbs: (M, F) of each limb: the length to the middle, logarithms of radii.
-    """
-
-    curves: Tensor
+    curves: Tensor  # (M, S, 3) points of the limbs, from the tips towards the middle of the body
     geodesics: Tensor
     volumes: Tensor
-    limbs: Tensor
+    limbs: Tensor  # (M, F) of each limb: the length to the middle, logarithms of radii
 
     def __len__(self) -> int:
         return len(self.curves)
@@ -86,12 +81,7 @@ def _observed(
 
 
 class TipFeatures:
-    """Features of a frame whose tips have names, which are the same in all frames if the names are right.
-
-    In four groups: one term for each tip of its distances, which depends on how a limb bends and where its end is
-    found; the rest of the distances, which differs between the sides of the body; volumes; the limbs' lengths and
-    radii.
-    """
+    """Features of a frame whose tips have names, which are the same in all frames if the names are right."""
 
     def __init__(self, num_names: int, num_limb_features: int, *, with_volumes: bool) -> None:
         self.num_names, self.num_limb_features = num_names, num_limb_features
@@ -115,10 +105,7 @@ class TipFeatures:
         return torch.where((first >= 0) & (second >= 0), values, torch.nan)
 
     def __call__(self, frame: TipObservations, maps: Tensor, median_distances: Tensor) -> Tensor:
-        """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN for missing tips.
-
-        Distances to missing tips are replaced by the medians between named tips, (K (K - 1) / 2,).
-        """
+        """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN for missing tips."""
         index, found = maps.clamp_min(0), maps >= 0
         distances = self.distances(frame, maps)
         complete = torch.where(distances.isnan(), median_distances, distances)

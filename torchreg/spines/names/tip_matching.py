@@ -34,18 +34,12 @@ _SEARCH = MappingSearch()
 
 @dataclass(frozen=True, eq=False)
 class TipReference:
-    """The limbs of a known frame, to which others are matched.
+    """The limbs of a known frame, to which others are matched."""
 
-    Args:
-        tips: (K, 3), or curves (K, S, 3) of the limbs, from the tip inwards.
-        lengths: (K, K) path lengths along the skeleton from tip to tip; None: not compared.
-        rotation_weight: of the rotation itself, which should be small between frames near in time.
-    """
-
-    tips: Tensor
-    lengths: Tensor | None = None
+    tips: Tensor  # (K, 3), or curves (K, S, 3) of the limbs, from the tip inwards
+    lengths: Tensor | None = None  # (K, K) path lengths along the skeleton from tip to tip; None: not compared
     weight: float = 1.0
-    rotation_weight: float = 0.0
+    rotation_weight: float = 0.0  # of the rotation itself, which should be small between frames near in time
 
 
 def rank_mappings(
@@ -129,10 +123,7 @@ class _MappingCosts:
         return (total / weight + self.missing_cost * (maps < 0).sum(-1).to(total)) / maps.shape[1]
 
     def _rigid_errors(self, number: int, maps: Tensor) -> Tensor:
-        """Return the squared errors (P,) of the rigid fits, and of their rotations, to a reference.
-
-        A fit needs no more than sums of products of coordinates, which add up over the limbs of a mapping.
-        """
+        """Return the squared errors (P,) of the rigid fits, and of their rotations, to a reference."""
         known, weights = self.known[number], self.weights
         limb = torch.arange(len(known), device=maps.device)
 

@@ -44,10 +44,6 @@ def track_tips(
 ) -> TipNames:
     """Return the names of the tips in all frames, see `name_over_time`.
 
-    The reference is the middle of the longest run of frames that have K tips, the most frequent topology of these and,
-    if there are such frames, no loops. With a prior its tips are the K, and the reference is the frame, of some with K
-    tips, that it fits best.
-
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2.
     """
     if prior is not None:

@@ -11,9 +11,6 @@ from torchreg.spines.skeleton.tip_trees import TipTree
 def metanode_junctions(trees: Sequence[TipTree]) -> list[tuple[Tips, ...]]:
     """Return the junctions of the tree to which all trees shrink when contradicting branch nodes are merged.
 
-    Walking inward from a tip, the next branch nodes of all trees are one supernode; supernodes that share a branch node
-    of any tree become one metanode. A limb between two junctions is left where every tree has it.
-
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figure 3B.
     """
     if len(trees) == 2:

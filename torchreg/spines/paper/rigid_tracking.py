@@ -19,9 +19,6 @@ _NEVER_MISSING = 1e6
 def track_tips_rigidly(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> tuple[Tensor, int]:
     """Return the labels (T, K) of the tips in all frames, see `tip_nodes`, and the reference frame.
 
-    The reference is the middle of the longest run of frames with K tips. Those are compared with it alone; others with
-    it and with the frame with K tips that is nearest in time.
-
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2, eqs. 6-8.
     """
     counts = [len(skeleton.tips) for skeleton in skeletons]

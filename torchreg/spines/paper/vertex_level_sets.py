@@ -15,9 +15,6 @@ _MOST_EDGES = 0.95
 def vertex_level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
     """Return the connected parts of the bins of vertices as bands, and a ring on the way from each band to a next one.
 
-    The center and covariance of a ring are those of the band behind it. Bins are at least as wide as most edges are
-    long.
-
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figures 2 and 3A.
     """
     edges, vertices = torch.from_numpy(mesh.edges), torch.from_numpy(mesh.vertices)

@@ -34,12 +34,7 @@ _RECENTERING = Recentering()
 def centered_curves(
     curves: Sequence[Tensor], mesh: TriangleMesh, thickness: float, free: Sequence[tuple[bool, bool]]
 ) -> list[Tensor]:
-    """Return curves (n, 3) with inner points at the centers of perpendicular slices (Tagliasacchi et al. 2009).
-
-    Centers of geodesic level sets are off the axis in bends by up to a tenth of the radius. A triangle belongs to the
-    nearest curve and stretch of it; curves stay where slices are not round, as at junctions. ``free``: whether the
-    first and the last point move with those next to them.
-    """
+    """Return curves (n, 3) with inner points at the centers of perpendicular slices (Tagliasacchi et al. 2009)."""
     samples, areas = mesh.vertices[mesh.faces].mean(1), mesh.face_areas()
     thickness = max(thickness, _RECENTERING.min_thickness * float(areas.mean().sqrt()))
     curves = list(curves)

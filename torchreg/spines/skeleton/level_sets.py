@@ -16,31 +16,18 @@ from torchreg.geometry.surface_graph import unique_edges
 
 @dataclass(frozen=True, eq=False)
 class LevelSets:
-    """The rings of all levels at once; every ring separates two bands.
+    """The rings of all levels at once; every ring separates two bands."""
 
-    Args:
-        centers: (R, 3) centroids of the rings as curves, whatever the density of vertices on them.
-        covariances: (R, 3, 3) mean over a ring's length of the outer product of offsets from its center.
-        lengths: (R,) of the rings.
-        levels: (R,) int64: on ring r the function is ``levels[r] * spacing``.
-        lower: (R,) band on the side of smaller values.
-        upper: (R,) band on the side of larger values.
-        vertex_bands: (V,) band that each vertex lies in.
-        num_bands: B; a band is a connected part of the surface between two levels.
-        faces: (S,) triangles that rings pass through, once for each passage.
-        face_rings: (S,) the ring of each passage.
-    """
-
-    centers: Tensor
-    covariances: Tensor
-    lengths: Tensor
-    levels: Tensor
-    lower: Tensor
-    upper: Tensor
-    vertex_bands: Tensor
-    num_bands: int
-    faces: Tensor
-    face_rings: Tensor
+    centers: Tensor  # (R, 3) centroids of the rings as curves, whatever the density of vertices on them
+    covariances: Tensor  # (R, 3, 3) mean over a ring's length of the outer product of offsets from its center
+    lengths: Tensor  # (R,) of the rings
+    levels: Tensor  # (R,) int64: on ring r the function is ``levels[r] * spacing``
+    lower: Tensor  # (R,) band on the side of smaller values
+    upper: Tensor  # (R,) band on the side of larger values
+    vertex_bands: Tensor  # (V,) band that each vertex lies in
+    num_bands: int  # B; a band is a connected part of the surface between two levels
+    faces: Tensor  # (S,) triangles that rings pass through, once for each passage
+    face_rings: Tensor  # (S,) the ring of each passage
 
     def __len__(self) -> int:
         return self.centers.shape[0]
@@ -62,9 +49,6 @@ class MeshEdges:
 
 def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
     """Return the rings on which a function (V,), linear on each triangle, is a multiple of ``spacing``.
-
-    The paper sorts vertices into bins and takes their means as nodes; these rings cut the triangles instead, so they do
-    not depend on the meshing.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1; Verroust and Lazarus 2000.
     """
@@ -94,11 +78,7 @@ def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
 
 
 class _Crossings:
-    """The crossings of triangles and edges with levels, all levels at once.
-
-    Bands are made of items: vertices, then parts of edges between two levels without a vertex, then such parts of
-    triangles.
-    """
+    """The crossings of triangles and edges with levels, all levels at once."""
 
     def __init__(self, mesh: MeshEdges, bands: np.ndarray) -> None:
         self.mesh, self.bands = mesh, bands

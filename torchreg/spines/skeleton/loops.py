@@ -53,11 +53,7 @@ class OpenedLoops:
 
 
 def open_loops(mesh: TriangleMesh, min_length: float, num_levels: int) -> OpenedLoops:
-    """Return a closed surface with every long loop cut at its thinnest ring, and the ends closed (Wood et al. 2004).
-
-    Loops are those of level sets of the distance from a far vertex, and ``min_length`` a share of its maximum. A
-    contact, as of a hand on the hip, is thinner than what leads to it; a ring cut into two limbs has two tips.
-    """
+    """Return a closed surface with every long loop cut at its thinnest ring, and the ends closed (Wood et al. 2004)."""
     opened = OpenedLoops.from_uncut(mesh)
     for _ in range(_CUTTING.max_cuts):
         if _euler_number(opened.mesh) >= 2:

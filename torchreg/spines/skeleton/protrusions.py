@@ -23,8 +23,6 @@ class Protrusions:
 def average_geodesic_distance(graph: Graph, areas: Tensor, num_base: int) -> tuple[Tensor, float]:
     """Return the average geodesic distances (V,) of all nodes to the surface, and the largest from a base point.
 
-    Base points are farthest-point samples, weighted by the area (V,) of the nodes nearest to them.
-
     References: Hilaga et al. 2001; Brostow et al. 2004, section 4.1.
     """
     rows: list[Tensor] = []
@@ -38,11 +36,7 @@ def average_geodesic_distance(graph: Graph, areas: Tensor, num_base: int) -> tup
 
 
 def find_protrusions(graph: Graph, values: Tensor, least_height: float) -> Protrusions:
-    """Return the local maxima of a function whose persistence exceeds a height, and at least the highest one.
-
-    Persistence is the least fall on a path to a higher maximum (Edelsbrunner, Letscher and Zomorodian 2002); noise
-    makes maxima of no more than twice its amplitude.
-    """
+    """Return the local maxima of a function whose persistence exceeds a height, and at least the highest one."""
     edges = graph.edges()[0].numpy()
     peaks, basin = _basins(edges, values.numpy())
     heights = _persistence(values.numpy(), edges, peaks, basin)

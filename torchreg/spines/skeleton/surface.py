@@ -31,11 +31,7 @@ def split_surface(value: Any, name: str, support: str) -> tuple[TriangleMesh | T
 
 
 def as_surface(value: Any, name: str) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Return the surface of a mesh, or of points without faces, and notes on it.
-
-    Points that show most of a body from both sides have that of `poisson_body`; others, as of leaves or of a single
-    view, that of `cloud_surface`.
-    """
+    """Return the surface of a mesh, or of points without faces, and notes on it."""
     points = points_without_faces(value)
     if points is None:
         return as_mesh(value, name), ()

@@ -12,15 +12,11 @@ from torchreg.geometry.mesh import TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class TipRelations:
-    """Relations between the K tips of a surface that bending does not change, float64.
+    """Relations between the K tips of a surface that bending does not change, float64."""
 
-    Args:
-        geodesics: (K, K) distances along the surface.
-        volumes: (K, K, K) ``1/6 integral of d_a dd_b ^ dd_c`` over the surface: the signed volume enclosed by the map
-            that takes each point to its distances from tips a, b and c. A body has +v, its mirror image -v.
-    """
-
-    geodesics: Tensor
+    geodesics: Tensor  # (K, K) distances along the surface
+    # (K, K, K) ``1/6 integral of d_a dd_b ^ dd_c`` over the surface: the signed volume enclosed by the map that takes
+    # each point to its distances from tips a, b and c. A body has +v, its mirror image -v.
     volumes: Tensor
 
     def of_tips(self, order: Tensor) -> TipRelations:

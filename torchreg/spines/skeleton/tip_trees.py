@@ -21,10 +21,7 @@ _MAX_TRIPLES = 400
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A stretch of a tree between points at which paths diverge: the tips beyond it, its rings (n,) from the root.
-
-    The first ring is that in which it diverges from others, the last that in which the paths to its tips diverge.
-    """
+    """A stretch of a tree between points at which paths diverge: the tips beyond it, its rings (n,) from the root."""
 
     tips: Tips
     rings: Tensor
@@ -64,9 +61,7 @@ def grow_tip_tree(sets: LevelSets, bands: Tensor, root: int, bridges: Tensor | N
 
     A path leads from band (K,) to band through the least number of rings; of two between the same bands through the
     longer one. Bumps that are no tips leave no branch; around handles the shortest path is taken. ``bridges`` (B, 2)
-    are bands joined between pieces.
-
-    References: Brostow et al. 2004, section 4.1, "walking along edges of the surface graph".
+    are bands joined between pieces (Brostow et al. 2004, section 4.1, "walking along edges of the surface graph").
     """
     lower, upper, length = sets.lower.numpy(), sets.upper.numpy(), sets.lengths.numpy()
     ring = np.arange(len(sets))
@@ -135,10 +130,7 @@ def majority_splits(trees: Sequence[TipTree]) -> list[Tips]:
 
 
 def estimate_junction(junction: tuple[Tips, ...], trees: Sequence[TipTree]) -> tuple[Tensor, Tensor]:
-    """Return the position (3,) of a junction, and the mean width () of its rings in the trees.
-
-    The mean center of the rings in which paths between three of its limbs meet, weighted by how compact the rings are.
-    """
+    """Return the position (3,) of a junction, and the mean width () of its rings in the trees."""
     positions, widths = [], []
     for tree in trees:
         rings = tree.junction_rings(junction)
@@ -149,11 +141,7 @@ def estimate_junction(junction: tuple[Tips, ...], trees: Sequence[TipTree]) -> t
 
 
 def consensus_junctions(trees: Sequence[TipTree], overlap: float) -> list[tuple[Tips, ...]]:
-    """Return the junctions of the tree on which most trees agree, see `junctions_from_splits`.
-
-    Of the majority's junctions, those closer than ``overlap`` times the sum of widths are merged, closest first, and
-    estimated anew: the metanodes of Brostow et al. 2004, section 4.1, "Merging Skeletons".
-    """
+    """Return the junctions of the tree on which most trees agree, see `junctions_from_splits`."""
     if len(trees) == 2:
         return []
     splits = majority_splits(trees)
