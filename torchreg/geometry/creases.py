@@ -14,10 +14,7 @@ _SMOOTH = math.radians(30)
 
 
 def welded(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which vertices of triangles to keep (V',), faces (F, 3) over these, and unit normals (V', 3), float64.
-
-    Corners at one position whose triangles meet under less than 30 degrees are one vertex: edges stay sharp.
-    """
+    """Return vertices to keep (V',), faces (F, 3) over these, and unit normals; edges over 30 degrees stay sharp."""
     corners = faces.reshape(-1).cpu()
     points = vertices.detach().cpu()[corners]
     corner, second, third = points.double().view(-1, 3, 3).unbind(1)

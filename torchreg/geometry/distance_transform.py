@@ -9,10 +9,7 @@ from torch import Tensor
 
 
 def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the distance of every cell's center to the border of a mask of any shape, negative inside, in cells.
-
-    The border runs half a cell outside of the centers inside; infinite without a border. Maurer, Qi and Raghavan 2003.
-    """
+    """Return distances of cells to the border of a mask, in cells, negative inside; infinite without a border."""
     inside = mask.cpu().numpy()
     if inside.all() or not inside.any():
         distance = torch.full(mask.shape, torch.inf, dtype=dtype)

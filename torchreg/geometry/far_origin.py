@@ -24,10 +24,7 @@ _FAR = _Far()
 
 
 def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
-    """Return an origin (3,) float64 of whole numbers near double-precision points that lie far from zero.
-
-    None for points that float32 holds well, and for those in it already.
-    """
+    """Return an origin (3,) of whole numbers near far double-precision points, None where float32 is good enough."""
     tensors = [points] if isinstance(points, Tensor) else list(points)
     if not tensors or any(tensor.dtype != torch.float64 for tensor in tensors):
         return None
@@ -37,10 +34,7 @@ def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
 
 
 def to_local(value: Value, origin: Tensor | None) -> Value:
-    """Return points (..., 3), poses (..., D), a scan or an observation in coordinates that begin at an origin (3,).
-
-    Tensors become float64. Nothing changes without a value or an origin.
-    """
+    """Return points, poses (..., D), a scan or an observation in float64 from an origin (3,); the same without one."""
     if value is None or origin is None:
         return value
     given: Any = value

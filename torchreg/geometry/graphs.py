@@ -66,10 +66,7 @@ class Graph:
         return torch.from_numpy(distance), torch.from_numpy(number[np.where(source >= 0, source, -1)])
 
     def shortest_paths(self, source: int) -> tuple[Tensor, Tensor]:
-        """Return the distance (V,) float64 of every node from a source, and its predecessor (V,) int64 on the path.
-
-        Nodes without a path are infinitely far; their predecessor is -1, as is that of the source.
-        """
+        """Return distances (V,) from a source, and predecessors (V,), -1 for the source and without a path."""
         distance, before = csgraph.dijkstra(self._matrix(), indices=source, return_predecessors=True)
         return torch.from_numpy(distance), torch.from_numpy(before.astype(np.int64)).clamp(min=-1)
 
@@ -129,20 +126,14 @@ def minimum_spanning_forest(edges: Tensor, lengths: Tensor, count: int) -> Spann
 
 
 def rooted(edges: Tensor, roots: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the parent (count,) int64 of each node of a forest, and the nodes in an order with parents first.
-
-    Roots, and nodes in no root's tree, have the parent -1; the latter are left out of the order.
-    """
+    """Return parents (count,) in a forest, -1 for roots and nodes in no root's tree, and the others, parents first."""
     first, second = edges.cpu().numpy().T
     order, parents = _breadth_first(_adjacency(first, second, np.ones(len(first)), count), roots.cpu().numpy())
     return parents.to(edges.device), order.to(edges.device)
 
 
 def component_links(points: Tensor, component: Tensor, count: int = 3) -> tuple[Tensor, Tensor]:
-    """Return the shortest links that join components one by one to the largest, the nearest component first.
-
-    Per component ``count`` pairs of points (L, 2), the smaller index first, and their distances (L,) float64.
-    """
+    """Return the shortest links (L, 2) that join components one by one, ``count`` a pair, and their lengths (L,)."""
     joined = component == component.bincount().argmax()
     distance = torch.full((len(points),), torch.inf, dtype=torch.float64, device=points.device)
     nearest = torch.zeros_like(component)

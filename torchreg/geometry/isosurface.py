@@ -27,10 +27,7 @@ _TRIANGLES = {
 
 
 def isosurface(field: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, spacing: float) -> TriangleMesh:
-    """Return the mesh where a field of points (n, 3) in a box is zero, oriented from negative to positive values.
-
-    By marching tetrahedra (Doi and Koide 1991); the mesh is closed where the surface stays inside the box.
-    """
+    """Return the mesh of the zeros of a field in a box, facing positive values (Doi and Koide 1991)."""
     grid = _Grid(lower, upper, spacing)
     with torch.no_grad():
         samples = torch.arange(math.prod(grid.sizes), device=lower.device).split(BUDGET.field_points)

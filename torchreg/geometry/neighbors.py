@@ -59,10 +59,7 @@ class NeighborTree:
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
     def nearest_within(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-        """Return the result of `nearest`, but index 0 and infinity without a target within the radius.
-
-        Many times quicker than `nearest` where most points are far from all targets.
-        """
+        """Return the result of `nearest`, but index 0 and infinity without a target within the radius."""
         distance, index = self._tree.query(_coordinates(points), distance_upper_bound=radius)
         index = np.where(np.isfinite(distance), index, 0)
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)

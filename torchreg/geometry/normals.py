@@ -48,11 +48,7 @@ def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None) -> Tens
 
 
 def orient_normals(points: Tensor, normals: Tensor, *, viewpoint: Tensor | None = None) -> Tensor:
-    """Return the normals (N, 3) with signs that agree between neighbors and face the camera (Hoppe et al. 1992, 3.3).
-
-    Signs propagate along the minimum spanning tree of the neighbor graph. Without a viewpoint the largest component is
-    taken to be convex, the others face the same side, and planar ones face the origin.
-    """
+    """Return normals (N, 3) with signs that agree between neighbors and face the camera (Hoppe et al. 1992)."""
     positions, which = distinct_positions(points)
     first = torch.full((len(positions),), len(points)).scatter_reduce(0, which, torch.arange(len(points)), "amin")
     exact = normals.detach().cpu().double()

@@ -20,10 +20,7 @@ SEARCH = PlaneSearch()
 
 
 def distance_to_plane(points: Tensor, counts: Tensor, band: float, generator: torch.Generator) -> Tensor:
-    """Return the distances (B, M) of points (B, M, 3) from the plane with the most counted points within ``band``.
-
-    References: Fischler and Bolles 1981; scores by Torr and Zisserman 2000.
-    """
+    """Return distances (B, M) of points (B, M, 3) from the plane of most counted points (Fischler and Bolles 1981)."""
     odds = counts.cpu().double() + 1e-9
     index = torch.multinomial(odds, 3 * SEARCH.num_triples, replacement=True, generator=generator).to(points.device)
     corners = points.gather(1, index.unsqueeze(-1).expand(-1, -1, 3)).unflatten(1, (-1, 3))

@@ -13,11 +13,7 @@ from torchreg.geometry.range_scan import RangeScan
 
 
 def clustered_scan(scan: RangeScan, count: int) -> tuple[RangeScan, Tensor, Tensor]:
-    """Return a scan with about ``count`` cluster points, their indices (M,) in the scan, and each point's cluster (N,).
-
-    A cluster joins nearby points that face the same way (Rossignac and Borrel 1993); it is on the boundary if one of
-    its points is. Scans of up to twice as many points are returned as they are.
-    """
+    """Return a scan of about ``count`` cluster points, their indices (M,), and the cluster (N,) of each point."""
     total, every = len(scan), torch.arange(len(scan), device=scan.points.device)
     if total <= 2 * count:
         return scan, every, every

@@ -254,11 +254,7 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
 def build_skeleton(
     limbs: Sequence[tuple[Tensor, Tensor, Tensor]], ends: Sequence[tuple[int, int]], notes: Sequence[str] = ()
 ) -> Skeleton:
-    """Return the skeleton of limbs, polylines (points (n, 3), radii (n,), frames (n, 3, 3)) that share end nodes.
-
-    ``ends`` names the first and last node of each limb by integers; a node's position, radius and frame come from the
-    first limb that names it.
-    """
+    """Return the skeleton of limbs (points (n, 3), radii, frames) whose ends are nodes named by integers."""
     number: dict[int, int] = {}
     values: list[tuple[Tensor, Tensor, Tensor]] = []
     edges: list[tuple[int, int]] = []

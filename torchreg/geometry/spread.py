@@ -13,10 +13,7 @@ SPREADS = ("at one place", "on a line", "on a plane")
 
 
 def spread_dimensions(points: Tensor, size: float | Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return the rank (...), 0 to 3, of points (..., N, 3): directions of deviation above a thousandth of the largest.
-
-    Points within a millionth of ``size`` are at one position.
-    """
+    """Return the rank (...), 0 to 3, of points (..., N, 3), whose position is precise to a millionth of ``size``."""
     points = points.detach().double()
     weights = torch.ones_like(points[..., 0]) if valid is None else valid.to(points)
     total = weights.sum(-1).clamp_min(1)[..., None, None]

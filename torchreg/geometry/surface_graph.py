@@ -61,6 +61,7 @@ def _edge_keys(faces: Tensor) -> tuple[Tensor, int]:
 
 def _is_closed(faces: Tensor, keys: Tensor) -> bool:
     """Return whether every edge of triangles is used as often in one direction as in the other."""
+    # The sum of pseudo-random numbers of edges, signed by direction, is zero by chance once in 2^64.
     numbers = keys * -7046029254386353131  # the odd integer nearest to 2^64 over the golden ratio, as a signed one
     numbers = (numbers ^ (numbers >> 29)) * numbers
     return int(torch.where(faces < faces.roll(-1, dims=1), numbers, -numbers).sum()) == 0

@@ -162,10 +162,7 @@ def _unhidden(
 def sample_visible(
     mesh: TriangleMesh, camera: Tensor, count: int, generator: torch.Generator | None = None, *, density: str = "area"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``count`` points drawn from the side of a surface that faces a camera, with faces and barycentric weights.
-
-    "area" is uniform over the surface, "pixel" over the picture, as a range camera samples it.
-    """
+    """Return points of the side that faces a camera, uniform by "area" or "pixel", with faces and weights."""
     still = TriangleMesh(mesh.vertices.detach().double(), mesh.faces)
     view = aim(_used_vertices(still), camera, size=_VISIBILITY.resolution)
     flat = flatten(still, view)

@@ -8,11 +8,7 @@ from torch import Tensor
 
 
 def assign(costs: Tensor, unmatched_cost: Tensor | float | None = None) -> Tensor:
-    """Return the column (N,) int64 of each row in the least-cost assignment (Kuhn 1955) of costs (N, M), none twice.
-
-    Rows that stay unmatched get -1: at ``unmatched_cost``, a number or (N,), or, if that is None, only for lack of
-    columns.
-    """
+    """Return the least-cost column (N,) of each row of costs (N, M) (Kuhn 1955), -1 above ``unmatched_cost``."""
     rows, columns = costs.shape
     table = costs.detach()
     if unmatched_cost is not None:

@@ -62,10 +62,7 @@ def _split_order(split: Tips) -> tuple[int, list[int]]:
 
 
 def junctions_from_splits(splits: Collection[Tips], num_tips: int) -> list[tuple[Tips, ...]]:
-    """Return the junctions of the tree of compatible splits, each as the sets of tips that its limbs lead to.
-
-    The set that holds tip 0 comes first in each junction; the junction next to tip 0 is the first one.
-    """
+    """Return the junctions of compatible splits as the sets of tips behind their limbs, that with tip 0 first."""
     every = frozenset(range(num_tips))
     behind = sorted({every - {0}, *splits}, key=len, reverse=True)
     limbs = {tips: [every - tips] for tips in behind}
@@ -80,10 +77,7 @@ def without_tip_zero(tips: Tips, every: Tips) -> Tips:
 
 
 def number_nodes(graph: Tensor, num_samples: int) -> Tensor:
-    """Return the node of each sample of each limb (L, num_samples), for limbs (L, 2) that share their end nodes.
-
-    The nodes of the graph keep their numbers; the samples inside the limbs follow.
-    """
+    """Return the nodes (L, num_samples) of the samples of limbs (L, 2); those of the graph keep their numbers."""
     inner = len(graph) + 1 + torch.arange(len(graph) * (num_samples - 2), device=graph.device)
     return torch.cat((graph[:, :1], inner.reshape(len(graph), num_samples - 2), graph[:, 1:]), dim=1)
 
@@ -131,11 +125,7 @@ def most_frequent_splits(rows: Sequence[frozenset[Tips]]) -> frozenset[Tips]:
 
 
 def place_junctions(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph) -> list[int]:
-    """Return the node of the skeleton on which each junction of a graph lies.
-
-    It has the least sum of mean path lengths to the tips behind each of the junction's limbs: on a tree, where no limb
-    holds more than half of all. Of several equally good nodes it is the middle one.
-    """
+    """Return the node of a skeleton on which each junction lies: of least sum of mean paths to its limbs' tips."""
     nodes = tip_nodes(skeleton, labels)
     present = [label for label, node in enumerate(nodes) if node >= 0]
     lengths = path_lengths(skeleton, torch.tensor([nodes[label] for label in present]))

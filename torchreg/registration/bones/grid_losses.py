@@ -34,10 +34,7 @@ class JointEnergy(nn.Module):
 
 
 def smoothness_energy(weights: Tensor, edges: Tensor) -> Tensor:
-    """Return ``E = sum_{(c, d)} |v_c - v_d|^2`` (...) of weights (..., K, B) over edges (E, 2) between corners.
-
-    References: Chang and Zwicker 2009, eq. 6.
-    """
+    """Return ``sum_{(c, d)} |v_c - v_d|^2`` (...) of weights (..., K, B) over edges (E, 2) between corners (eq. 6)."""
     ends = weights.index_select(-2, edges.flatten()).unflatten(-2, (len(edges), 2))
     return (ends[..., 0, :] - ends[..., 1, :]).square().sum(-1).sum(-1)
 

@@ -152,11 +152,7 @@ class SparseGrid:
         return ((points - self.origin) @ self.axes) / self.spacing
 
     def locate(self, points: Tensor) -> GridLocation:
-        """Return the cell of every point (..., N, 3), and the trilinear coefficients of its corners.
-
-        A point outside all occupied cells belongs to the one nearest to its own cell, or to the nearest cell of its
-        side of the box, and takes the values of the nearest point there: nothing is extrapolated.
-        """
+        """Return the cell of each point (..., N, 3), or the nearest one, and trilinear coefficients."""
         return locate_in_cells(self.coordinates(points), self.shape, self.cells, self.nearest)
 
     def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
@@ -182,11 +178,7 @@ class SparseGrid:
         return torch.stack([number // self.num_corners, number % self.num_corners], dim=-1)
 
     def neighbors(self, gap: float = 0.0) -> Tensor:
-        """Return the pairs of cells (A, 2) that share a side, the lower number first, in order.
-
-        Regions that no chain of sides joins are joined by their nearest pairs of cells within ``gap`` empty cells: zero
-        joins what touches at edges and corners, a negative gap nothing.
-        """
+        """Return the pairs of cells (A, 2) that share a side, or join regions within ``gap`` empty cells."""
         pairs = torch.cat([self._side_by_side(axis) for axis in range(3)])
         if gap >= 0:
             pairs = torch.cat([pairs, self._bridges(pairs, gap)])

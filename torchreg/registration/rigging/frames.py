@@ -66,7 +66,7 @@ def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) 
         raise InputError(f"meshes must hold two frames of one thing at least; {'; '.join(notes.values())}")
     if template in notes:
         raise InputError(f"template must be a frame that shows the thing; {notes[template]}")
-    scans = [_double(as_scan(meshes[number], f"meshes[{number}]")) for number in kept]
+    scans = [as_scan(meshes[number], f"meshes[{number}]").to(device="cpu", dtype=torch.float64) for number in kept]
     chosen = _freest(scans) if template is None else kept.index(template)
     faces = scans[chosen].faces
     if faces is None:
@@ -95,7 +95,3 @@ def _radius(points: Tensor) -> Tensor:
     if not len(points):
         return points.new_tensor(0.0)
     return (points - points.median(0).values).norm(dim=-1).median()
-
-
-def _double(scan: RangeScan) -> RangeScan:
-    return scan.to(device="cpu", dtype=torch.float64)

@@ -43,10 +43,7 @@ def labeled(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, fr
 
 
 def border_cost(edges: Tensor, label: Tensor) -> float:
-    """Return minus the log odds of a border between neighbors, from the share of such edges, by Laplace's rule.
-
-    References: Besag 1975, pseudo-likelihood.
-    """
+    """Return minus the log odds of a border between neighbors, from the share of such edges (Besag 1975)."""
     borders = float((label[edges[:, 0]] != label[edges[:, 1]]).sum())
     share = min(0.5, (borders + 1) / (len(edges) + 2))
     return math.log((1 - share) / share)

@@ -63,10 +63,7 @@ def frames_to_pass_over(skeletons: Sequence[Skeleton]) -> list[int]:
 def with_frames_between(
     spine: SpineSequence, kept: Sequence[int], times: Tensor, passed: Mapping[int, Skeleton]
 ) -> SpineSequence:
-    """Return the spine with the outlier frames, interpolated in time, at the ends as the nearest one.
-
-    ``kept`` are the numbers of the spine's frames, ``passed`` the skeletons of the others.
-    """
+    """Return the spine with the outlier frames ``passed``, interpolated in time between the frames ``kept``."""
     count = len(kept) + len(passed)
     within = times.clamp(spine.times[0], spine.times[-1])
     nearest = (times[:, None] - spine.times).abs().argmin(1)

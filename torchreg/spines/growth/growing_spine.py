@@ -32,7 +32,9 @@ def growing_spine(
 ) -> SpineSequence:  # fmt: skip
     """Return the spine of growing surfaces with given skeletons, of two organs or more."""
     skeletons = [smooth_rough_limbs(skeleton) for skeleton, _ in found]
-    certainties = [_certainty(skeleton.confidence.cpu().double()) for skeleton, _ in found]
+    # Log-odds of tips are half of what their confidences say; a ball has none.
+    sure = [skeleton.confidence.cpu().double() for skeleton, _ in found]
+    certainties = [torch.where(c > 0, torch.logit(c, eps=1e-3) / 2, _NO_TIP) for c in sure]
     tracks = track_organs(observe_tips(skeletons, [relations for _, relations in found]), certainties)
     num_organs = tracks.labels.shape[1]
     if num_organs < 2:
@@ -63,11 +65,6 @@ def growing_spine(
         ends=tracks.ends,
         **statuses_and_warnings(_notes(skeletons, surfaces.notes, tracks, limbs)),
     )
-
-
-def _certainty(confidence: Tensor) -> Tensor:
-    """Return log-odds (M,) of tips, which are half of what their confidences say; a ball has none."""
-    return torch.where(confidence > 0, torch.logit(confidence, eps=1e-3) / 2, _NO_TIP)
 
 
 def _notes(

@@ -97,11 +97,7 @@ def _beside_others(inside: Tensor) -> Tensor:
 def move_inside(
     field: DepthField, curves: Tensor, radii: Tensor, free: Tensor, stiffness: float = _DESCENT.stiffness
 ) -> Tensor:
-    """Return curves (..., S, 3) moved by small steps until they lie at their depths and are smooth.
-
-    ``radii`` (..., S) is the depth that is enough; where the body is thinner, the curve stays in its middle. Points not
-    ``free`` stay; zero stiffness moves every point independently.
-    """
+    """Return curves (..., S, 3) whose ``free`` points moved to their depths ``radii`` or the middle of the body."""
     movable = free.any(-1)  # other curves stay as they are
     moved, radii, mask = curves[movable], radii.expand(free.shape)[movable], free[movable].unsqueeze(-1)
     if not len(moved):

@@ -244,11 +244,7 @@ def _joined_limbs(limbs: FrameLimbs, target: _Target) -> FrameLimbs:
 
 
 def transported_frames(curves: Tensor, reference: int) -> Tensor:
-    """Return frames ``R_world_curve`` (T, L, S, 3, 3) along curves (T, L, S, 3), transported through time.
-
-    They do not twist along the limbs in the reference frame; others rotate with the body and then by the smallest
-    angle.
-    """
+    """Return frames (T, L, S, 3, 3) along curves that rotate with the body, without twist at the reference."""
     frames: dict[int, Tensor] = {reference: curve_frames(curves[reference])}
     for order in (range(reference + 1, len(curves)), range(reference - 1, -1, -1)):
         last = reference

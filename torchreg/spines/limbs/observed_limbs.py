@@ -56,11 +56,7 @@ def smooth_rough_limbs(skeleton: Skeleton) -> Skeleton:
 
 
 def observe_limbs(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph, num_samples: int) -> FrameLimbs:
-    """Return the limbs of a graph, as curves of S points, that a frame's skeleton has.
-
-    A junction is observed if tips behind three of its limbs are; a limb is the path between two observed nodes, unless
-    it has much of its path in common with another.
-    """
+    """Return the limbs between nodes that a skeleton shows; a junction needs tips behind three of its limbs."""
     nodes, node_radii = skeleton.nodes.detach().cpu().double(), skeleton.radii.detach().cpu().double()
     index = _graph_nodes(skeleton, labels, graph)
     limbs = graph.edges.tolist()

@@ -42,10 +42,7 @@ def track_tips(
     relations: Sequence[TipRelations] | None = None,
     workers: int | None = 1,
 ) -> TipNames:
-    """Return the names of the tips in all frames, see `name_over_time`.
-
-    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2.
-    """
+    """Return the names of the tips in all frames, see `name_over_time` (Brostow et al. 2004, section 4.2)."""
     if prior is not None:
         num_tips = len(prior.tips)
     elif num_tips is None:

@@ -9,10 +9,7 @@ from torchreg.spines.skeleton.tip_trees import TipTree
 
 
 def metanode_junctions(trees: Sequence[TipTree]) -> list[tuple[Tips, ...]]:
-    """Return the junctions of the tree to which all trees shrink when contradicting branch nodes are merged.
-
-    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figure 3B.
-    """
+    """Return the junctions of all trees after contradicting nodes are merged (Brostow et al. 2004, figure 3B)."""
     if len(trees) == 2:
         return []
     every = frozenset(range(len(trees)))

@@ -17,10 +17,7 @@ _NEVER_MISSING = 1e6
 
 
 def track_tips_rigidly(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> tuple[Tensor, int]:
-    """Return the labels (T, K) of the tips in all frames, see `tip_nodes`, and the reference frame.
-
-    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2, eqs. 6-8.
-    """
+    """Return the labels (T, K) of tips, see `tip_nodes`, and the reference frame (Brostow et al. 2004, eqs. 6-8)."""
     counts = [len(skeleton.tips) for skeleton in skeletons]
     num_tips = most_frequent_count(counts) if num_tips is None else num_tips
     full = [count == num_tips for count in counts]

@@ -13,10 +13,7 @@ _MOST_EDGES = 0.95
 
 
 def vertex_level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
-    """Return the connected parts of the bins of vertices as bands, and a ring on the way from each band to a next one.
-
-    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figures 2 and 3A.
-    """
+    """Return the parts of bins of vertices as bands, and the rings between them (Brostow et al. 2004, figure 2)."""
     edges, vertices = torch.from_numpy(mesh.edges), torch.from_numpy(mesh.vertices)
     lengths = (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=-1)
     bins = (values / max(spacing, float(lengths.quantile(_MOST_EDGES)))).floor().long()

@@ -118,11 +118,7 @@ class Clearance:
         return nearest + depth * torch.nn.functional.normalize(nearest - points, dim=-1)
 
     def ascend(self, points: Tensor, reach: float) -> Tensor:
-        """Return points (N, 3) on the medial axis near those given inside the surface: local maxima of the clearance.
-
-        The ascent follows the mean direction away from the nearest parts of the surface while the clearance grows and
-        the point stays inside and within reach.
-        """
+        """Return the local maxima (N, 3) of the clearance, on the medial axis, within reach of points inside."""
         start, samples = points.double(), self._coarse
         position, step = start, torch.full((len(points), 1), _ASCENT.step, dtype=torch.float64)
         distance = _distance_table(position, samples)

@@ -48,10 +48,7 @@ class MeshEdges:
 
 
 def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
-    """Return the rings on which a function (V,), linear on each triangle, is a multiple of ``spacing``.
-
-    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1; Verroust and Lazarus 2000.
-    """
+    """Return the rings on which a function (V,) is a multiple of ``spacing`` (Verroust and Lazarus 2000)."""
     heights = values.numpy() / spacing
     bands = np.floor(heights).astype(np.int64)
     crossings = _Crossings(mesh, bands)

@@ -71,11 +71,7 @@ def largest_cost(trees: Sequence[TipTree]) -> float:
 def best_rings(
     tips: Tips, trees: Sequence[TipTree], start: JunctionBall | None, end: JunctionBall | None, cost: float
 ) -> Rings:
-    """Return the rings of a limb from ``start`` to ``end`` from the tree in which its quality is best (eq. 4 and 5).
-
-    Rings in the balls of its junctions are left out; a limb that ends in a tip has None there. Empty if no tree has the
-    limb. Brostow et al. 2004.
-    """
+    """Return the rings of a limb, outside the balls at its ends, from the tree of best quality (eqs. 4 and 5)."""
     every = frozenset(range(len(trees)))
     best = Rings(torch.zeros(0, 3).double(), torch.zeros(0, 3, 3).double(), torch.zeros(0).double())
     for tree in trees:

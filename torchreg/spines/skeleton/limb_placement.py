@@ -56,12 +56,7 @@ class Interior:
         return points[score.argsort(descending=True, stable=True)]
 
     def cap_limb(self, tip: Tensor, rings: Rings) -> tuple[Tensor, Rings]:
-        """Return the last point (3,) of a limb and its rings, which start at its tip (3,).
-
-        Rings nearer to the tip than they are wide are left out; the limb extends straight from the others to the height
-        of the tip, or, where that leads outside, to a point between the tip and the nearest ring whose center is
-        inside.
-        """
+        """Return the last point (3,) of a limb, straight on to its tip, and its rings but those near the tip."""
         around = ((rings.centers - tip).norm(dim=-1) > _PLACEMENT.min_distance * rings.widths).nonzero()[:, 0]
         if len(around) and around[0] <= _PLACEMENT.max_skipped * len(rings):
             limb = rings[int(around[0]) :]

@@ -56,17 +56,14 @@ def open_loops(mesh: TriangleMesh, min_length: float, num_levels: int) -> Opened
     """Return a closed surface with every long loop cut at its thinnest ring, and the ends closed (Wood et al. 2004)."""
     opened = OpenedLoops.from_uncut(mesh)
     for _ in range(_CUTTING.max_cuts):
-        if _euler_number(opened.mesh) >= 2:
+        mesh = opened.mesh
+        if mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces >= 2:  # Euler's formula
             break
-        ring = _thinnest_ring(opened.mesh, min_length, num_levels)
+        ring = _thinnest_ring(mesh, min_length, num_levels)
         if ring is None:
             break
         opened = _cut_ring(opened, *ring)
     return opened
-
-
-def _euler_number(mesh: TriangleMesh) -> int:
-    return mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces
 
 
 def _cut_ring(opened: OpenedLoops, faces: Tensor, length: float) -> OpenedLoops:

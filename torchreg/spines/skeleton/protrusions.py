@@ -21,10 +21,7 @@ class Protrusions:
 
 
 def average_geodesic_distance(graph: Graph, areas: Tensor, num_base: int) -> tuple[Tensor, float]:
-    """Return the average geodesic distances (V,) of all nodes to the surface, and the largest from a base point.
-
-    References: Hilaga et al. 2001; Brostow et al. 2004, section 4.1.
-    """
+    """Return the average geodesic distances (V,) of nodes, and the largest from a base point (Hilaga et al. 2001)."""
     rows: list[Tensor] = []
     nearest = graph.distances([0])[0]
     for _ in range(min(num_base, len(graph))):

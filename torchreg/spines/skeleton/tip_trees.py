@@ -115,10 +115,7 @@ def _groups(paths: dict[int, list[int]], tips: tuple[int, ...], position: int) -
 
 
 def majority_splits(trees: Sequence[TipTree]) -> list[Tips]:
-    """Return the splits of the tips that more than half of the trees show, any two of which are compatible.
-
-    References: Margush and McMorris 1981, majority-rule consensus; Brostow et al. 2004, figure 3B.
-    """
+    """Return the splits that more than half of the trees show, all compatible (Margush and McMorris 1981)."""
     every = frozenset(range(len(trees)))
     votes = Counter(
         without_tip_zero(branch.tips, every)
