@@ -95,8 +95,8 @@ def test_what_is_out_of_range_is_refused_by_name(name):
 
 
 def test_a_start_has_no_place_in_it(pair):
-    for given in ({"start": pair.truth}, {"parts": pair.labels}):
-        with pytest.raises(tr.errors.InputError, match=rf"{next(iter(given))} cannot be used by RegisterConfig.paper\(\)"):
-            tr.register(pair.source, pair.target, config=PAPER(), **given)
+    for name, value in (("start", pair.truth), ("parts", pair.labels)):
+        with pytest.raises(tr.errors.InputError, match=rf"{name} cannot be used by RegisterConfig.paper\(\)"):
+            tr.register(pair.source, pair.target, config=PAPER(), **{name: value})
     with pytest.raises(tr.errors.InputError, match="registers pairs only"):
         tr.register_sequence([pair.source, pair.target], config=PAPER())
