@@ -16,14 +16,11 @@ BALL = unit_sphere(4, dtype=torch.float64)
 HELD = [(False, False)]  # both ends of a curve stay
 
 
-@pytest.mark.parametrize("mesh", [BALL, with_mixed_winding(BALL)])
-def test_inside_of_a_ball_whatever_the_winding(mesh):
+def test_inside_of_a_ball_whatever_the_winding_and_small_holes():
     points = 0.8 * random(10, 200, 3)
     sure = (points.norm(dim=-1) - 1).abs() > 0.01
-    assert torch.equal(Inside(mesh)(points)[sure], (points.norm(dim=-1) < 1)[sure])
-
-
-def test_a_small_hole_is_outvoted_and_nothing_is_inside_nothing():
+    for mesh in (BALL, with_mixed_winding(BALL)):
+        assert torch.equal(Inside(mesh)(points)[sure], (points.norm(dim=-1) < 1)[sure])
     closed = BALL.vertices[BALL.faces].mean(1)[:, 2] < 0.97
     assert bool(Inside(tr.TriangleMesh(BALL.vertices, BALL.faces[closed]))(torch.zeros(3)))
     assert not Inside(tr.TriangleMesh(torch.zeros(1, 3), torch.zeros(0, 3).long()))(torch.zeros(2, 3)).any()
@@ -39,12 +36,10 @@ def test_clearance_is_the_distance_to_the_surface_and_is_climbed_to_the_axis_wit
     assert clearance(middles).min() > 0.27
     assert bool((clearance(middles) >= clearance(points)).all())
     assert (clearance.ascend(points, 0.05) - points).norm(dim=1).max() <= 0.05
-
-
-def test_points_outside_are_moved_past_the_surface():
-    moved = Clearance(CAPSULE).behind_surface(torch.tensor([[0.0, 0.5, 0.0], [1.5, 0, 0]]).double(), 0.1)
-    assert bool(Inside(CAPSULE)(moved).all())
-    assert Clearance(CAPSULE)(moved).tolist() == pytest.approx([0.1, 0.1], abs=0.02)
+    # Points outside are moved past the surface.
+    within = clearance.behind_surface(torch.tensor([[0.0, 0.5, 0.0], [1.5, 0, 0]]).double(), 0.1)
+    assert bool(Inside(CAPSULE)(within).all())
+    assert clearance(within).tolist() == pytest.approx([0.1, 0.1], abs=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -52,17 +47,15 @@ def sphere():
     return DepthField(BALL, 48)
 
 
-def test_depth_in_a_sphere_is_the_distance_to_it_whatever_was_asked_before(sphere):
+def test_depth_in_a_sphere_is_the_distance_to_it_and_grows_towards_the_middle(sphere):
     points = 0.75 * random(300, 3)
     points = points[points.norm(dim=-1) < 1.2]
     error = (sphere(points) - (1 - points.norm(dim=-1))).abs()
     assert float(error.max()) < 1.2 * sphere.spacing
     assert float(error.mean()) < 0.4 * sphere.spacing
+    # Whatever was asked before.
     fresh = DepthField(BALL, 48)
     assert torch.equal(torch.stack([fresh(point) for point in points.flip(0)]).flip(0), sphere(points))
-
-
-def test_the_gradient_of_depth_points_to_the_middle(sphere):
     points = torch.nn.functional.normalize(random(50, 3, seed=1).float(), dim=-1)
     for share, cosine in ((0.7, 0.9), (1.1, 0.8)):
         up = torch.nn.functional.normalize(sphere.gradient(share * points), dim=-1)

@@ -20,17 +20,13 @@ def relations(mesh, tips):
     return surface_relations(mesh, GeodesicGraph.from_mesh(mesh).distances(vertices), vertices)
 
 
-def test_the_volume_of_three_distances_is_that_of_the_surface_that_they_map_to():
-    ball = unit_sphere(3, dtype=torch.float64)
+def test_volumes_are_those_that_distances_map_to_and_change_sign_in_a_mirror_not_by_pose_or_winding():
+    ball, matrix = unit_sphere(3, dtype=torch.float64), similarity(2, 2.0)
     found = surface_relations(ball, random(3, 3) @ ball.vertices.mT, torch.tensor([0, 1, 2])).volumes
     volume = torch.linalg.det(ball.vertices[ball.faces]).sum() / 6
     assert float(found[0, 1, 2]) == pytest.approx(float(torch.linalg.det(random(3, 3)) * volume))
-
-
-def test_relations_tell_a_body_from_its_mirror_image_and_not_its_pose_or_winding():
-    ball = unit_sphere(3, dtype=torch.float64)
     bumpy = ball.vertices * (1 + 0.3 * (ball.vertices @ random(3, 1, seed=4)).sin())
-    mesh, tips, matrix = tr.TriangleMesh(bumpy, ball.faces), bumpy[[3, 40, 77, 120]], similarity(2, 2.0)
+    mesh, tips = tr.TriangleMesh(bumpy, ball.faces), bumpy[[3, 40, 77, 120]]
     found, mirror = relations(mesh, tips), torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     assert float(found.volumes.abs().max()) > 1e-3
     torch.testing.assert_close(found.volumes, -found.volumes.transpose(0, 1))
@@ -71,12 +67,17 @@ def test_the_best_chain_and_the_chances_of_its_states_are_those_of_all_chains():
         torch.testing.assert_close(found, wanted)
 
 
-def test_names_one_step_away_are_all_that_differ_by_an_exchange_or_one_tip():
+def test_names_one_step_away_and_exchanges_of_mirrored_names_are_all_there_are():
     names = (2, 0, -1)
     found = {tuple(row) for row in name_chain._exchanged(torch.tensor([names]), 4).tolist()}
     every = {row for row in product(range(-1, 4), repeat=3) if len([k for k in row if k >= 0]) == len({*row} - {-1})}
     moves = {row for row in every if sum(a != b for a, b in zip(row, names, strict=True)) <= 1}
     assert found == moves | {(0, 2, -1), (-1, 0, 2), (2, -1, 0)}
+    for count, number in ((3, 4), (5, 26), (6, 76)):  # permutations that undo themselves
+        rows = torch.tensor(list(body_mirror._exchanges(list(range(count)), 0)))
+        assert rows[0].tolist() == list(range(count))
+        assert len(rows.unique(dim=0)) == len(rows) == number
+        assert bool((rows.gather(1, rows) == torch.arange(count)).all())
 
 
 def test_residuals_of_distances_do_not_depend_on_where_the_end_of_a_limb_lies():
@@ -139,14 +140,6 @@ def test_legs_keep_their_names_in_any_order_of_tips(body, lift, reference):
     assert bool((found.confidence[reference] == 1).all())
     if not lift:
         assert bool((found.confidence > 0.5).all())
-
-
-@pytest.mark.parametrize(("count", "number"), [(3, 4), (5, 26), (6, 76)])
-def test_exchanges_are_all_permutations_that_undo_themselves(count, number):
-    rows = torch.tensor(list(body_mirror._exchanges(list(range(count)), 0)))
-    assert rows[0].tolist() == list(range(count))
-    assert len(rows.unique(dim=0)) == len(rows) == number
-    assert bool((rows.gather(1, rows) == torch.arange(count)).all())
 
 
 def test_a_mirror_gives_the_features_of_the_mirrored_frame_under_exchanged_names():

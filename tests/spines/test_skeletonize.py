@@ -84,7 +84,7 @@ def test_order_winding_noise_and_coarsening_do_not_matter(star, skeleton, change
     assert torch.cdist(star.tips[0], found.nodes[found.tips]).amin(1).max() < 0.1
 
 
-def test_holes_are_closed_and_noted(star):
+def test_holes_are_closed_and_noted_and_fragments_left_out_by_policy(star):
     mesh = star.meshes[0]
     middles = mesh.vertices[mesh.faces].mean(1)
     rim = middles[(middles - star.curves[0, 2, 24]).norm(dim=1).argmin()]
@@ -92,6 +92,12 @@ def test_holes_are_closed_and_noted(star):
     assert found.topology == STAR
     assert any("hole" in note for note in found.notes)
     assert Inside(mesh)(found.nodes).float().mean() > 0.995
+    pair = concatenate([tr.TriangleMesh(0.05 * BALL.vertices.float() + 2, BALL.faces), mesh])
+    found = tr.skeletonize(pair)
+    assert found.topology == STAR
+    assert found.notes[0].startswith("1 fragment(s) left out")
+    with pytest.raises(tr.errors.InputError, match="mesh must be one piece, got 2"):
+        tr.skeletonize(pair, tr.SkeletonizeConfig(pieces="error"))
 
 
 def test_what_the_body_stands_on_is_left_out_or_kept(star):
@@ -104,15 +110,6 @@ def test_what_the_body_stands_on_is_left_out_or_kept(star):
         assert tr.skeletonize(both).topology == STAR
     assert len(warned) == 1
     assert tr.skeletonize(both, support="keep").topology != STAR
-
-
-def test_fragments_by_policy(star):
-    pair = concatenate([tr.TriangleMesh(0.05 * BALL.vertices.float() + 2, BALL.faces), star.meshes[0]])
-    found = tr.skeletonize(pair)
-    assert found.topology == STAR
-    assert found.notes[0].startswith("1 fragment(s) left out")
-    with pytest.raises(tr.errors.InputError, match="mesh must be one piece, got 2"):
-        tr.skeletonize(pair, tr.SkeletonizeConfig(pieces="error"))
 
 
 def test_a_limb_in_two_pieces_and_loops_are_bridged():
@@ -151,20 +148,17 @@ def test_a_long_loop_is_cut_and_noted():
     assert bypassed.confidence.tolist() == [0, 0]
 
 
-def test_a_ball_is_a_single_limb_of_no_confidence():
+def test_a_ball_is_a_single_limb_of_no_confidence_and_the_smallest_surfaces_have_one():
     found = tr.skeletonize(BALL)
     assert found.topology == "(())"
     assert found.confidence.tolist() == [0, 0]
     assert "no limb stands out" in found.notes[0]
     assert found.nodes.norm(dim=1).max() < 1
-
-
-@pytest.mark.parametrize("faces", [[[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], [[0, 1, 2]]])
-def test_the_smallest_surfaces_there_are(faces):
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])[: 1 + max(max(face) for face in faces)]
-    found = tr.skeletonize(tr.TriangleMesh(corners, torch.tensor(faces)))
-    assert len(found.tips) >= 2
-    assert bool(torch.isfinite(found.nodes).all())
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    for count, faces in ((4, [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]), (3, [[0, 1, 2]])):
+        found = tr.skeletonize(tr.TriangleMesh(corners[:count], torch.tensor(faces)))
+        assert len(found.tips) >= 2
+        assert bool(torch.isfinite(found.nodes).all())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -65,17 +65,15 @@ def test_junctions_of_nested_splits():
     assert all(0 in junction[0] for junction in junctions)
 
 
-def test_bands_may_be_joined_by_bridges():
+def test_bands_may_be_joined_by_bridges_and_of_two_paths_around_a_handle_the_shorter_is_taken():
     # Two stacks of rings; bands 0-1-2 and 3-4-5, joined between 2 and 3.
-    sets = chain(torch.zeros(4, 3), torch.eye(3).expand(4, 3, 3), lower=[0, 1, 3, 4], upper=[1, 2, 4, 5])
+    eye = torch.eye(3)
+    sets = chain(torch.zeros(4, 3), eye.expand(4, 3, 3), lower=[0, 1, 3, 4], upper=[1, 2, 4, 5])
     tree = grow_tip_tree(sets, torch.tensor([0, 5]), 0, torch.tensor([[2, 3]]))
     assert [branch.rings.tolist() for branch in tree.branches] == [[0, 1, 2, 3]]
-
-
-def test_of_two_paths_around_a_handle_the_shorter_is_taken():
     # A ring of bands 0-1-2-3 and back; two rings lead from 2 to 3.
     lengths = torch.tensor([1.0, 1, 1, 2, 1])
-    sets = chain(torch.zeros(5, 3), torch.eye(3).expand(5, 3, 3), lengths, lower=[0, 1, 2, 2, 0], upper=[1, 2, 3, 3, 3])
+    sets = chain(torch.zeros(5, 3), eye.expand(5, 3, 3), lengths, lower=[0, 1, 2, 2, 0], upper=[1, 2, 3, 3, 3])
     for start, paths in ((0, ([[4]],)), (1, ([[1, 3]], [[0, 4]]))):
         tree = grow_tip_tree(sets, torch.tensor([start, 3]), 0)
         assert [branch.rings.tolist() for branch in tree.branches] in paths
@@ -95,7 +93,7 @@ def tree(root, tips, widths, shift=0.0):
     return TipTree(root, sets, (Branch(frozenset(tips), torch.arange(count)),))
 
 
-def test_the_version_with_the_best_quality_is_taken():
+def test_the_version_with_the_best_quality_is_taken_without_rings_in_the_balls_at_its_ends():
     trees = [tree(0, {1}, [1.0] * 8), tree(1, {0}, [0.5] * 8, shift=0.1)]
     assert largest_cost(trees) == pytest.approx(1.0)
     # Q = N - sum C: 8 (1 - 1) and 8 (1 - 1/4).
@@ -105,24 +103,22 @@ def test_the_version_with_the_best_quality_is_taken():
     # That tree grew from the other end.
     assert best.centers[0, 0] == 1.0
     assert len(best_rings(frozenset({0, 1}), trees, None, None, 1.0)) == 0
-
-
-def test_rings_in_the_balls_at_the_ends_are_left_out():
     trees = [tree(0, {1}, [0.1] * 11), tree(1, {0}, [1.0] * 11)]
-    start = JunctionBall(torch.tensor([0.0, 0.05, 0.0]).double(), 0.25)
-    end = JunctionBall(torch.tensor([0.9, 0.0, 0.0]).double(), 0.15)
+    start, end = ball(0.25, 0.0, 0.05), ball(0.15, 0.9)
     best = best_rings(frozenset({1}), trees, start, end, 1.0)
     assert best.centers[:, 0].tolist() == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.7])
-    large = JunctionBall(torch.tensor([0.5, 0.0, 0.0]).double(), 2.0)
-    assert len(best_rings(frozenset({1}), trees, large, None, 1.0)) == 0
+    assert len(best_rings(frozenset({1}), trees, ball(2.0, 0.5), None, 1.0)) == 0
+
+
+def ball(radius, x=0.0, y=0.0):
+    return JunctionBall(torch.tensor([x, y, 0.0]).double(), radius)
 
 
 def test_a_limb_that_comes_back_to_its_junction_is_not_cut_short():
     ring = circle(count=40, turn=(0.5, 1.4)) + torch.tensor([1.0, 0.0, 0.0])
     sets = chain(ring, 0.01 * torch.eye(3).expand(40, 3, 3).double())
     trees = [TipTree(0, sets, (Branch(frozenset({1}), torch.arange(40)),)), tree(1, {0}, [1.0])]
-    best = best_rings(frozenset({1}), trees, JunctionBall(torch.zeros(3).double(), 0.8), None, 1.0)
-    assert len(best) > 30
+    assert len(best_rings(frozenset({1}), trees, ball(0.8), None, 1.0)) > 30
 
 
 def test_first_axes_follow_the_major_axes_of_the_rings_without_jumps_and_do_not_spin_on_round_ones():
