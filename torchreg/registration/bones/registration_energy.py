@@ -63,23 +63,6 @@ def _distance(state: EnergyState) -> Tensor:
     return len(state.model.grid_cells) / state.squared_spacing * mean
 
 
-def _joint(state: EnergyState) -> Tensor:
-    """Return eq. 4 (...) in squared cells."""
-    return JointEnergy()(state.transforms, state.moments) / state.squared_spacing
-
-
-def _smoothness(state: EnergyState) -> Tensor:
-    return smoothness_energy(state.model.weights, state.edges)
-
-
-def _norm(state: EnergyState) -> Tensor:
-    return normalization_energy(state.model.weights)
-
-
-def _discontinuity(state: EnergyState) -> Tensor:
-    return closeness_energy(state.model.weights, state.label_weights)
-
-
 class EnergyTerm(NamedTuple):
     """A term of the energy: its value (...) of a state, () where motions do not matter, and the paper's weight."""
 
@@ -90,10 +73,10 @@ class EnergyTerm(NamedTuple):
 # A new term is a function of the state, and a row here.
 TERMS = {
     "distance": EnergyTerm(_distance, 1.0),
-    "joint": EnergyTerm(_joint, 0.05),
-    "smoothness": EnergyTerm(_smoothness, 0.5),
-    "norm": EnergyTerm(_norm, 1.0),
-    "discontinuity": EnergyTerm(_discontinuity, 0.0),
+    "joint": EnergyTerm(lambda s: JointEnergy()(s.transforms, s.moments) / s.squared_spacing, 0.05),
+    "smoothness": EnergyTerm(lambda s: smoothness_energy(s.model.weights, s.edges), 0.5),
+    "norm": EnergyTerm(lambda s: normalization_energy(s.model.weights), 1.0),
+    "discontinuity": EnergyTerm(lambda s: closeness_energy(s.model.weights, s.label_weights), 0.0),
 }
 
 
