@@ -33,12 +33,11 @@ def clouds(folder):
     return [folder / "robot0.ply", folder / "robot1.ply"]
 
 
-def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, tmp_path):
-    answer = run(
+def test_the_base_is_written_as_numbers_for_ros_and_drawn(done, folder, clouds, tmp_path):
+    output = done(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
-    assert "base within" in answer.output
+    assert "base within" in output
     written = json.loads((tmp_path / "base_transform.json").read_text())
     found = tr.load(tmp_path / "base.safetensors")
     assert written["T_camera_base"] == found.T_camera_base.tolist()
@@ -59,12 +58,11 @@ def transform_of(path):
     return placed, joint.find("parent").get("link")
 
 
-def test_the_camera_joins_the_robot_in_its_file_and_for_easy_handeye(run, folder, clouds, tmp_path):
-    answer = run(
+def test_the_camera_joins_the_robot_in_its_file_and_for_easy_handeye(done, folder, clouds, tmp_path):
+    done(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base",
         "--urdf-out", tmp_path / "seen.urdf",
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
     inverse = tr.load(tmp_path / "base.safetensors").T_camera_base.inverse()
     placed, parent = transform_of(tmp_path / "seen.urdf")
     torch.testing.assert_close(placed, inverse)
@@ -78,7 +76,7 @@ def test_the_camera_joins_the_robot_in_its_file_and_for_easy_handeye(run, folder
     assert [float(written[name]) for name in "xyz"] == pytest.approx(inverse[:3, 3].tolist())
 
 
-def test_a_camera_on_a_link_joins_this_link(run, folder, tmp_path):
+def test_a_camera_on_a_link_joins_this_link(done, folder, tmp_path):
     arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
     skin, files = arm.file_skin(), []
     for number, joints in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
@@ -90,11 +88,10 @@ def test_a_camera_on_a_link_joins_this_link(run, folder, tmp_path):
         )
         files.append(tmp_path / f"{number}.ply")
     (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.9,0.2\n")
-    answer = run(
+    done(
         "calibrate", folder / "arm.urdf", *files, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base",
         "--camera-link", "upper", "--urdf-out", tmp_path / "seen.urdf",
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
     found = tr.load(tmp_path / "base.safetensors")
     torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
     placed, parent = transform_of(tmp_path / "seen.urdf")
@@ -109,13 +106,12 @@ def yaml_numbers(path):
     return dict(line.strip().split(": ", 1) for line in path.read_text().splitlines() if ": " in line)
 
 
-def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(run, folder, clouds, tmp_path):
+def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(done, folder, clouds, tmp_path):
     (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.5,0.2\n")
-    answer = run(
+    output = done(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base"
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
-    assert "or in other joints: robot1.ply" in answer.output
+    assert "or in other joints: robot1.ply" in output
     assert json.loads((tmp_path / "base_transform.json").read_text())["outliers"] == [1]
 
 
@@ -147,17 +143,13 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     assert "--mask has no meaning without --depth" in masks
 
 
-def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(run, folder, tmp_path, monkeypatch):
+def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(done, folder, tmp_path, monkeypatch):
     clouds = folder / "cloud0.ply", folder / "cloud3.ply"
-    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand")
-    assert answer.exit_code == 0, answer.output
-    assert float(re.search(r"lengths ([\d.]+) times those of the shape", answer.output)[1]) == pytest.approx(
-        1, abs=0.05
-    )
+    output = done("calibrate", "hand", *clouds, "-o", tmp_path / "hand")
+    assert float(re.search(r"lengths ([\d.]+) times those of the shape", output)[1]) == pytest.approx(1, abs=0.05)
     found = tr.load(tmp_path / "hand.safetensors")
     assert found.poses.shape == (2, 27)
     doubtful = replace(found, outliers=(1,), status=tr.Status.WITH_WARNINGS)
     monkeypatch.setattr("torchreg.alignment.calibrate.calibrate", lambda *given: doubtful)
-    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
-    assert answer.exit_code == 0
-    assert answer.output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"
+    output = done("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
+    assert output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"

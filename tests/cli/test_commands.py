@@ -313,9 +313,8 @@ def test_wrong_shapes_are_answered_with_what_there_is(error_of, folder, tmp_path
     assert message in error_of("info", *given)
 
 
-def test_figures_are_drawn_and_formats_listed(run, error_of, tmp_path, monkeypatch):
-    answer = run("figure", "bending", "-o", tmp_path / "fig2.png")
-    assert answer.exit_code == 0, answer.output
+def test_figures_are_drawn_and_formats_listed(run, done, error_of, tmp_path, monkeypatch):
+    done("figure", "bending", "-o", tmp_path / "fig2.png")
     with Image.open(tmp_path / "fig2.png") as file:
         assert min(file.size) > 100
     assert "NAME must be one of bending, readme; got 'spine'" in error_of("figure", "spine")

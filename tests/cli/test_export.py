@@ -139,12 +139,11 @@ PLAIN, FRAMES = (1, True), (3, True)
         ("size", "a.glb", (), lambda found, path: len(trimesh.load_scene(path).geometry) == 3),
     ],
 )
-def test_every_ending_is_written(run, results, starfish, folder, tmp_path, name, file, options, check):
+def test_every_ending_is_written(done, results, starfish, folder, tmp_path, name, file, options, check):
     place = starfish if name == "spine" else folder
     data = [word for option in options for word in ("--data", place / option)]
-    answer = run("export", results / name, "-o", tmp_path / file, *data)
-    assert answer.exit_code == 0, answer.output
-    assert answer.output.endswith(f"-> {tmp_path / file}\n")
+    output = done("export", results / name, "-o", tmp_path / file, *data)
+    assert output.endswith(f"-> {tmp_path / file}\n")
     found = tr.load(results / f"{name}.safetensors")
     assert check(found, tmp_path / file)
 

@@ -28,16 +28,15 @@ def masks(starfish, tmp_path_factory):
     return [place / name for name in ring.names], place / "calib.json"
 
 
-def test_old_options_write_as_export_does_and_are_warned_of_once(run, starfish, tmp_path):
+def test_old_options_write_as_export_does_and_are_warned_of_once(run, done, starfish, tmp_path):
     given = [word if word in OLD else tmp_path / word for pair in OLD.items() for word in pair]
-    answer = run("spine", starfish, "-o", tmp_path / "a.glb", *given, "--pictures", tmp_path / "a", "--workers", 1)
-    assert answer.exit_code == 0, answer.output
-    assert "5 tips, 1 junction, 5 limbs; 3 of 3 frames" in answer.output
+    output = done("spine", starfish, "-o", tmp_path / "a.glb", *given, "--pictures", tmp_path / "a", "--workers", 1)
+    assert "5 tips, 1 junction, 5 limbs; 3 of 3 frames" in output
     assert tr.load(tmp_path / "a.safetensors").num_tips == 5
     (tmp_path / "new").mkdir()
     for option, name in {**OLD, "--pictures": "a", "-o": "a.glb"}.items():
         measured = ["--data", starfish] if name in ("a.gif", "a", "a.glb") else []
-        assert answer.output.count(f"{option} goes with the next release") == (option != "-o")
+        assert output.count(f"{option} goes with the next release") == (option != "-o")
         run("export", tmp_path / "a", *measured, "-o", tmp_path / "new" / name)
     written = [path for path in sorted((tmp_path / "new").rglob("*")) if path.is_file()]
     assert len(written) == 3 + 4 + 3 + 1
@@ -106,12 +105,11 @@ def test_errors_take_one_line(error_of, starfish, tmp_path, options, message):
     assert message in error_of("spine", starfish, "-o", tmp_path / "a.glb", *given)
 
 
-def test_masks_of_several_cameras_become_a_spine(run, error_of, masks, tmp_path):
+def test_masks_of_several_cameras_become_a_spine(run, done, error_of, masks, tmp_path):
     folders, calibration = masks
     command = ("spine", "--silhouettes", *folders, "--calibration", calibration, "--resolution", 48)
-    answer = run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept")
-    assert answer.exit_code == 0, answer.output
-    assert "5 tips, 1 junction, 5 limbs" in answer.output
+    output = done(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept")
+    assert "5 tips, 1 junction, 5 limbs" in output
     whole = tr.load(tmp_path / "s.safetensors")
     assert [path.name for path in (tmp_path / "s_seen").iterdir()] == ["hull_0000.png"]
     assert run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept", "--force").exit_code == 0
@@ -137,9 +135,8 @@ def test_a_prior_gives_the_names(run, error_of, starfish, tmp_path):
         assert "--prior must be a spine (.safetensors) or a skeleton (.swc)" in message
 
 
-def test_tips_that_may_grow(run, starfish, tmp_path):
-    answer = run("spine", starfish, "-o", tmp_path / "a.glb", "--growing", "--quiet", "--workers", 1)
-    assert answer.exit_code == 0, answer.output
+def test_tips_that_may_grow(done, starfish, tmp_path):
+    done("spine", starfish, "-o", tmp_path / "a.glb", "--growing", "--quiet", "--workers", 1)
     assert tr.load(tmp_path / "a.safetensors").births.tolist() == [0] * 5
 
 

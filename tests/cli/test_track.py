@@ -113,10 +113,9 @@ def stop_at(monkeypatch, frame, error=KeyboardInterrupt):
     monkeypatch.setattr(tr.Tracker, "step", stopped)
 
 
-def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command, whole, tmp_path):
-    answer = run(*command("--pictures", tmp_path / "live", "--bvh", tmp_path / "r.bvh"))
-    assert answer.exit_code == 0, answer.output
-    assert f"{FRAMES} frames: {FRAMES} tracked; " in answer.output
+def test_a_sequence_is_tracked_and_everything_asked_for_is_written(done, command, whole, tmp_path):
+    output = done(*command("--pictures", tmp_path / "live", "--bvh", tmp_path / "r.bvh"))
+    assert f"{FRAMES} frames: {FRAMES} tracked; " in output
     names = ["live", "r.bvh", "r.gif", "r.glb", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     result = tr.load(tmp_path / "r.safetensors")
@@ -129,7 +128,7 @@ def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command,
     assert tr.ArticulatedShape.from_gltf(tmp_path / "r.glb").part_names[0] == "palm"
 
 
-def test_far_coordinates_keep_their_digits_and_are_drawn_near_zero(run, sequence, whole, tmp_path):
+def test_far_coordinates_keep_their_digits_and_are_drawn_near_zero(run, done, sequence, whole, tmp_path):
     far, start = (
         torch.tensor([5e5, 4e6, 0.0]).double(),
         json.loads((sequence / "start.json").read_text(encoding="utf-8")),
@@ -138,9 +137,8 @@ def test_far_coordinates_keep_their_digits_and_are_drawn_near_zero(run, sequence
     moved = [value + far[number].item() if number < 3 else value for number, value in enumerate(start)]
     (tmp_path / "far.json").write_text(json.dumps(moved), encoding="utf-8")
     command = "track", "hand", tmp_path / "far.xyz", "-o", tmp_path / "r", "--start", tmp_path / "far.json"
-    answer = run(*command, "--movie", "none")
-    assert answer.exit_code == 0, answer.output
-    assert "r.glb holds coordinates from 500000 4" in answer.output
+    output = done(*command, "--movie", "none")
+    assert "r.glb holds coordinates from 500000 4" in output
     found = tr.load(tmp_path / "r.safetensors")
     torch.testing.assert_close(found.poses[0, :3] - far, whole.poses[0, :3].double(), atol=1e-3, rtol=0)
     assert np.abs(trimesh.load_scene(tmp_path / "r.glb").bounds).max() < 10
@@ -293,7 +291,7 @@ def test_options_reach_the_tracker(run, command, interrupted):
     )
 
 
-def test_without_a_start_the_shape_is_searched_for(run, sequence, tmp_path, monkeypatch):
+def test_without_a_start_the_shape_is_searched_for(done, sequence, tmp_path, monkeypatch):
     start = torch.tensor(json.loads((sequence / "start.json").read_text(encoding="utf-8")))
     asked = []
 
@@ -302,8 +300,7 @@ def test_without_a_start_the_shape_is_searched_for(run, sequence, tmp_path, monk
         return tr.PoseStarts(start[None], torch.zeros(1), torch.ones(()))
 
     monkeypatch.setattr("torchreg.tracking.recovery.find_pose", found)
-    answer = run("track", "hand", sequence / "frames", "-o", tmp_path / "r", *FAST)
-    assert answer.exit_code == 0, answer.output
+    done("track", "hand", sequence / "frames", "-o", tmp_path / "r", *FAST)
     # What was found everywhere is checked by the same search in one more frame.
     assert len(asked) == 2
     assert tr.load(tmp_path / "r.safetensors").acquired[0] == "found"
@@ -322,14 +319,13 @@ def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
     assert (tmp_path / "live" / "frame_0000.png").exists()
 
 
-def test_a_robot_is_tracked(run, folder, tmp_path):
+def test_a_robot_is_tracked(done, folder, tmp_path):
     pose = tr.ArticulatedShape.from_urdf(folder / "arm.urdf", free_base=False).rest_pose()
     (tmp_path / "start.json").write_text(json.dumps(pose.tolist()), encoding="utf-8")
-    answer = run(
+    done(
         "track", folder / "arm.urdf", folder / "arm.npz", "-o", tmp_path / "r", "--start", tmp_path / "start.json",
         *FAST,
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
     assert abs(tr.load(tmp_path / "r.safetensors").poses[0, 0].item() - 0.02) < 0.005
 
 
@@ -457,15 +453,13 @@ def test_frames_that_changed_since_and_states_of_other_results_are_refused(run, 
     assert "has the state after 2 frames beside 1 results" in error_of(*own)
 
 
-def test_every_frame_is_shown_while_it_is_tracked(run, command, sequence, tmp_path, monkeypatch):
+def test_every_frame_is_shown_while_it_is_tracked(done, command, sequence, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the viewer needs viser")
     shown = []
     monkeypatch.setattr(
-        "torchreg.viz.live_track.LiveTrack.show",
-        lambda self, points, frame: shown.append((len(points), frame.frame)),
+        "torchreg.viz.live_track.LiveTrack.show", lambda self, points, frame: shown.append((len(points), frame.frame))
     )
     frames = ["frames/frame_0000.ply", "frames/frame_0001.ply"]
-    answer = run(*command(*FAST, "--view", "--port", "0", "--no-browser", frames=frames))
-    assert answer.exit_code == 0, answer.output
-    assert "http://127.0.0.1:" in answer.output
+    output = done(*command(*FAST, "--view", "--port", "0", "--no-browser", frames=frames))
+    assert "http://127.0.0.1:" in output
     assert shown == [(len(tr.load_points(sequence / name)), number) for number, name in enumerate(frames)]

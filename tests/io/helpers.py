@@ -10,9 +10,8 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.gltf_player import KINDS, TYPES
 
-KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 9: "MAT3", 16: "MAT4"}
 TURN = [0, 0, -np.sqrt(0.5), np.sqrt(0.5)]  # a quarter turn about z, clockwise
 
 

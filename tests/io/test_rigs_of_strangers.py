@@ -221,20 +221,6 @@ def test_degrees_of_freedom_that_have_the_name_of_a_joint_are_told_apart(tmp_pat
     assert shape.dof_names[6:9] == ("root_x_x", "root_x_y#", "root_x_z")
 
 
-def test_quantized_geometry_is_read(tmp_path, scene):
-    """Positions of 16 bits, which the inverse bind matrices put right, as gltfpack writes them."""
-    step = np.diag([4 / 60000] * 3 + [1.0])
-    stored = np.round(VERTICES / step[0, 0]).astype("i2")
-    shares = np.round(255 * np.stack([1 - UPPER, UPPER, 0 * UPPER, 0 * UPPER], 1)).astype("u1")
-    scene.json["extensionsRequired"] = ["KHR_mesh_quantization"]
-    primitive = scene.primitive(POSITION=stored, WEIGHTS_0=(shares, True))
-    scene.rig([primitive], inverse=[step, shift(0, -1, 0) @ step])
-    path = scene.save(tmp_path / "a.glb")
-    _, vertices = at_zero(path)
-    np.testing.assert_allclose(vertices, VERTICES, atol=1e-4)
-    np.testing.assert_allclose(vertices, shown(path), atol=1e-6)
-
-
 def compressed(scene, encode):
     """Put the bar into one block of bytes, its accessors without data of their own."""
     primitive = scene.primitive()

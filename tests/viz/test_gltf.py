@@ -131,7 +131,7 @@ def test_joints_of_spines_lie_on_the_curves_in_every_frame(tools, spine, tmp_pat
     viewer = tools.play(SPINE(tmp_path / "a.glb", spine.model, num_joints=8, fps=10.0))
     animation = viewer.gltf.animations[0]
     moves = [channel for channel in animation.channels if channel.target.path == "translation"]
-    places = np.stack([viewer.read(animation.samplers[channel.sampler].output) for channel in moves], 1)
+    places = np.stack([viewer.accessor(animation.samplers[channel.sampler].output) for channel in moves], 1)
     np.testing.assert_allclose(places, spine.curves.flatten(1, 2), atol=1e-6)
     np.testing.assert_allclose(viewer.seconds(), [0.0, 0.1, 0.2], atol=1e-6)
     assert viewer.gltf.nodes[moves[0].target.node].name == "limb_0_0"

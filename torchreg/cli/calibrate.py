@@ -64,8 +64,7 @@ def calibrate(
         ),
     ] = None,
     urdf_out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.urdf", help="The robot with a link camera, axes right, down, forward."),
+        Path | None, typer.Option(metavar="FILE.urdf", help="The robot with a link camera, axes right, down, forward.")
     ] = None,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",

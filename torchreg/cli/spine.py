@@ -90,8 +90,7 @@ def spine(
     ] = None,
     tips: Annotated[int | None, typer.Option(min=2, help="Number of tips; without it the most frequent one.")] = None,
     growing: Annotated[
-        bool,
-        typer.Option("--growing", help="Tips may appear and end, as those of a plant; names live as long."),
+        bool, typer.Option("--growing", help="Tips may appear and end, as those of a plant; names live as long.")
     ] = False,
     samples: Annotated[int, typer.Option(min=3, help="Points along each limb.")] = 24,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,

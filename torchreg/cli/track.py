@@ -42,8 +42,7 @@ class TrackerOptions:
     prediction: Annotated[str, typer.Option(help="Prediction of the motion: velocity, or none.")] = "velocity"
     points: Annotated[int, typer.Option(help="Number of model points.")] = 500
     model_points: Annotated[
-        str,
-        typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape."),
+        str, typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape.")
     ] = "seen"
     recovery: Annotated[
         str, typer.Option(help="What finding a lost shape may cost: full, starts (milliseconds), or none.")
@@ -82,10 +81,7 @@ def track(
     output: Annotated[
         Path,
         typer.Option(
-            "--output",
-            "-o",
-            metavar="RESULT",
-            help="RESULT.safetensors, .json, .glb, .gif and .progress are written.",
+            "--output", "-o", metavar="RESULT", help="RESULT.safetensors, .json, .glb, .gif and .progress are written."
         ),
     ] = Path("track"),
     *,

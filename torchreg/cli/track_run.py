@@ -170,28 +170,20 @@ class Report:
 
 @dataclass
 class TrackRun:
-    """Tracks frame after frame, and keeps on disk how far it got.
-
-    Args:
-        job: all that decides about the poses, as plain data.
-        save_every: frames between two writings.
-        seen: draws what the cameras saw of a frame.
-        live: shows a frame in the browser.
-        parts: results of the frames done.
-    """
+    """Tracks frame after frame, and keeps on disk how far it got."""
 
     tracker: Tracker
     clouds: Clouds
     fps: float
-    job: dict[str, Any]
+    job: dict[str, Any]  # all that decides about the poses, as plain data
     files: TrackFiles
     report: Report
-    save_every: int
+    save_every: int  # frames between two writings
     known: Known
     up: Direction | None
-    seen: Callable[[LinearBlendSkin], OnFrame] | None = None
-    live: Callable[[LinearBlendSkin], OnFrame] | None = None
-    parts: list[TrackResult] = field(default_factory=list)
+    seen: Callable[[LinearBlendSkin], OnFrame] | None = None  # draws what the cameras saw of a frame
+    live: Callable[[LinearBlendSkin], OnFrame] | None = None  # shows a frame in the browser
+    parts: list[TrackResult] = field(default_factory=list)  # results of the frames done
     state: TrackState = field(init=False)
 
     def __post_init__(self) -> None:

@@ -166,15 +166,7 @@ FORMATS: tuple[FileFormat, ...] = (
 def load_depth_camera(
     path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS
 ) -> tuple[Camera, float | None]:
-    """Return the camera of a depth image, float64, and its scale in metres per unit, None where the file has none.
-
-    Args:
-        path: a file of one camera, see `load_cameras`, which may have depth_scale, or depth_units, depth_factor, ...
-        limits: ``max_bytes`` applies.
-
-    Warns:
-        FileWarning: as `load_cameras`.
-    """
+    """Return the camera of a depth image, float64, and its metres per unit of depth, None where the file has none."""
     file = local_path(path)
     content = read_bytes(file, limits)
     if file.suffix.lower() == ".json" or _is_json(content):
@@ -192,12 +184,7 @@ def load_depth_camera(
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: CameraRig) -> None:
-    """Write cameras as JSON, in full precision.
-
-    Args:
-        path: a ``.json`` file; its folder must exist.
-        cameras: at least one.
-    """
+    """Write cameras as JSON, in full precision."""
     entries = [_entry(camera) for camera in cameras]
     _write(path, {"format": FORMAT, "version": _VERSION, "cameras": entries})
 

@@ -186,16 +186,7 @@ def load_frames(
 
 
 def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
-    """Write a sequence of clouds and return the files: one NPZ of frames, or a folder with one PLY per frame.
-
-    Args:
-        path: an archive ending in .npz, which is replaced, or a folder, which is made if it does not exist; in it the
-            files ``frame_0000.ply``, ``frame_0001.ply``, ... are replaced.
-        frames: T clouds (M_t, 3), finite; a folder cannot hold frames without points.
-
-    Returns:
-        Paths of the files, in order.
-    """
+    """Write T clouds (M_t, 3) as an .npz of frames or as a folder of files frame_0000.ply, ...; return the files."""
     target = local_path(path)
     clouds = [as_float_tensor(frame, f"frames[{number}]").detach().cpu() for number, frame in enumerate(frames)]
     if not clouds:

@@ -26,15 +26,9 @@ _MATERIALS = ("library_images", "library_effects", "library_materials", "bind_ma
 
 
 class MeshFiles:
-    """Finds and reads mesh files, each once.
+    """Finds and reads the mesh files of a description, each once; ``package://`` names in folders given and above it.
 
-    Args:
-        path: of the description.
-        package_dirs: folders to search for ``package://`` and ``model://`` names; those above the description are
-            searched as well.
-        require: whether it is an error if a file is missing or needs a reader that is not installed.
-        limits: largest size of a file.
-        warn: whether such files are told of where they are not required.
+    A file that is missing or needs a reader that is not installed is an error where it is required, else a warning.
     """
 
     def __init__(

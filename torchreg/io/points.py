@@ -326,21 +326,11 @@ def _face_rows(faces: Array, count: int, limits: FileLimits) -> Tensor:
 
 
 def save_points(
-    path: str | os.PathLike[str],
-    points: Any,
-    normals: Any = None,
-    colors: Any = None,
-    *,
-    faces: Any = None,
+    path: str | os.PathLike[str], points: Any, normals: Any = None, colors: Any = None, *, faces: Any = None
 ) -> None:
-    """Write a point cloud; the file appears whole or not at all.
+    """Write points (N, 3), normals (N, 3), colors (N, 3) from 0 to 1 and faces (F, 3); whole or not at all.
 
-    Args:
-        path: a local file ending in .ply, .pcd, .xyz, .txt, .csv or .npz; an existing file is replaced.
-        points: (N, 3) finite coordinates; their precision is kept.
-        normals: (N, 3) or None.
-        colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .csv, .npz); stored as bytes.
-        faces: (F, 3) vertex indices or None (.ply, .npz).
+    The path ends in .ply, .pcd, .xyz, .txt, .csv or .npz; colors are stored as bytes.
     """
     file = local_path(path)
     ending = file.suffix.lower()

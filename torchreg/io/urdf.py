@@ -55,28 +55,11 @@ def load_urdf(
     meshes: str = "warn",
     limits: FileLimits = DEFAULT_LIMITS,
 ) -> UrdfRecord:
-    """Return the kinematic tree and the geometry of a URDF file, with all numbers in float64.
+    """Return the kinematic tree and the geometry of a URDF file, float64, parents first.
 
-    Frames come parents first, each branch in the file's order. A mimic joint that follows another mimic joint is
-    rewritten to follow the first one. A joint without ``<limit>`` (or without both bounds) is unlimited.
-
-    The file is read as ROS's tools read it: namespaces mean nothing, comments may stand anywhere, and what cannot be
-    used of a link is left out with a warning. Floating and planar joints are held fixed, with a warning.
-
-    Args:
-        path: the .urdf file.
-        package_dirs: folders to search for meshes: of ``package://NAME/...`` and ``model://NAME/...`` such a folder
-            holds NAME or is called NAME. The folder of the file and those above are searched as well.
-        meshes: what becomes of mesh files that are missing or need a reader that is not installed: "warn" leaves them
-            out with a warning each, "skip" without, "require" raises.
-        limits: largest sizes accepted; a robot may have 2000 links.
-
-    Returns:
-        The robot. A link without readable visual geometry has its collision geometry.
-
-    Warns:
-        FileWarning: if something is left out or held fixed, an element has two origins, or angles seem to be degrees.
-        UnitsWarning: if links, joints or slides seem to be in another unit than the rest.
+    It is read as ROS's tools read it. A mimic joint of a mimic joint follows the first one. A link without readable
+    visual geometry has its collision geometry. What is left out or held fixed, and numbers that seem to be in another
+    unit, are warned of. ``meshes``, of files that are missing or cannot be read: "warn", "skip" or "require".
     """
     check_choice(meshes, "meshes", ("warn", "require", "skip"))
     source = local_path(path)

@@ -50,22 +50,12 @@ def load_opencv(
     unit: float = 1.0,
     limits: FileLimits = DEFAULT_LIMITS,
 ) -> CameraRig:
-    """Return the camera, or the stereo pair left and right, of an OpenCV YAML file.
+    """Return the camera, or the stereo pair left and right, of an OpenCV YAML file, float64.
 
-    A pair has ``M1 D1 M2 D2 R T`` (or ``cameraMatrix1 distCoeffs1 ...``, ``K1 ...``), where R and T map coordinates of
-    the left camera to the right one; the left one is at the origin. One camera has ``camera_matrix`` and
-    ``distortion_coefficients`` (or ``cameraMatrix distCoeffs``, ``K D``), and maybe R and T from the world. ROS's files
-    have ``K D R P``: the world is then that of the rectified pictures of the left camera. Kalibr's chains of cameras
-    and ORB-SLAM's settings are read as well.
-
-    Args:
-        path: the file.
-        size: (width, height) of the pictures, for files without ``image_width`` and ``image_height``.
-        unit: metres per unit of T, which is that of the calibration board, often 0.001.
-        limits: ``max_bytes`` applies.
-
-    Returns:
-        The cameras, float64.
+    A pair has ``M1 D1 M2 D2 R T``, whose R and T map coordinates of the left camera, at the origin, to the right one;
+    one camera has ``camera_matrix`` and ``distortion_coefficients``, and maybe R and T from the world. ROS's files have
+    ``K D R P``; Kalibr's chains and ORB-SLAM's settings are read as well. ``size`` (width, height) is for files without
+    one; ``unit`` is metres per unit of T, that of the calibration board.
     """
     if not (math.isfinite(unit) and unit > 0):
         raise InputError(f"unit must be positive and finite, got {unit}")
@@ -163,12 +153,7 @@ def values_of(document: Mapping[str, Any]) -> Values:
 
 
 def save_opencv(path: str | os.PathLike[str], cameras: CameraRig) -> None:
-    """Write one camera, or two as a pair, for OpenCV to read; metres, the left camera of a pair at the origin.
-
-    Args:
-        path: a ``.yml`` or ``.yaml`` file; its folder must exist.
-        cameras: one or two, with pictures of one size.
-    """
+    """Write one camera, or two as a pair, for OpenCV to read; metres, the left camera of a pair at the origin."""
     if len(cameras) > 2 or len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise InputError(f"OpenCV files hold one or two cameras with pictures of one size, got {len(cameras)}")
     first, last = cameras[0], cameras[len(cameras) - 1]

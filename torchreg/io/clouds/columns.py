@@ -81,11 +81,8 @@ def wanted_columns(names: Sequence[str]) -> list[int]:
 def cloud_of_columns(table: Array, names: Sequence[str] | None = None, *, intensity_first: bool = False) -> RawCloud:
     """Return the cloud in a table (N, C): x y z and, where they are there, normals and colors.
 
-    Args:
-        table: numbers.
-        names: of the columns; None where the file has none. Then x y z come first, and what follows is told by its
-            numbers: unit vectors are normals, whole numbers up to 255 (or 65535) or numbers from 0 to 1 are colors.
-        intensity_first: whether an intensity stands before colors where both orders are possible, as in .pts files.
+    Without names x y z come first; unit vectors are normals, whole numbers up to 255 (or 65535) or numbers from 0 to 1
+    colors. An intensity may stand before colors where both orders are possible, as in .pts files.
     """
     if names is not None:
         where = {kind: named_columns(names, kind) for kind in _NAMES}

@@ -67,13 +67,6 @@ def save_refitted_rig(
     every clip, are multiplied by ``l' / l``. Those of the root are by the ratio of the joints' distances from it, so
     that feet stay on the ground. Normals and tangents turn as the surface does. Morph targets and what hangs on joints
     without being skinned, as a tool in a hand, keep their size.
-
-    Args:
-        path: where to write; the suffix must be .glb.
-        source: the rigged .glb or .gltf file.
-        vertices: (V, 3) in the bind pose, in the order of `load_rig`, metres.
-        positions: (3,) of each joint in the bind pose by its name, metres.
-        skin: name or index of the one skin, as given to `load_rig`; all by default.
     """
     target, file = checked_path(path), local_path(source)
     with warnings.catch_warnings(), naming(file):

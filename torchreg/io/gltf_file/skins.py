@@ -245,12 +245,7 @@ def ancestors(node: int, parents: Sequence[int]) -> Iterator[int]:
 
 
 def bind_transforms(
-    document: GltfDocument,
-    skin: int,
-    names: Sequence[str],
-    weights: Array,
-    world: Array,
-    parents: Sequence[int],
+    document: GltfDocument, skin: int, names: Sequence[str], weights: Array, world: Array, parents: Sequence[int]
 ) -> Array:
     """Return the transforms (J, 4, 4) of a skin's joints in the bind pose.
 
