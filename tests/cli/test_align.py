@@ -196,27 +196,16 @@ def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of
     assert "--rig has no meaning for hand" in error_of(*hand)
 
 
-@pytest.fixture(scope="module")
-def files(folder, tmp_path_factory):
-    """Files with which an alignment ends."""
-    place = tmp_path_factory.mktemp("bad")
-    (place / "list.json").write_text("[1]", encoding="utf-8")
-    return place
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("none.ply",), "none.ply: No such file or directory"),
-        (("--start", "none.json"), "none.json: No such file or directory"),
         (("--start", "list.json"), "list.json must have shape (27)"),
         (("--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
-        (("--sigma", "a:b:c"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
         (("--sigma", "0.01:0.02:5"), "stop must not exceed start"),
         (("--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
         (("--scale", "0"), "--scale must be positive and finite, got 0.0"),
         (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand; leave it out"),
-        (("--parents", "list.json"), "--parents has no meaning for hand"),
         (("-o", "no/r.x"), "no does not exist; create it first"),
         (("--picture", "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
         (("--pose", "r.json"), "two outputs would be called"),
@@ -226,10 +215,13 @@ def files(folder, tmp_path_factory):
         (("--depth",), "--depth takes --intrinsics FILE with the camera"),
     ],
 )
-def test_errors_are_one_line(error_of, folder, files, arguments, message):
-    words = [files / word if "." in word and ":" not in word and not word[0].isdigit() else word for word in arguments]
-    assert message in error_of("align", "hand", folder / "cloud0.ply", "-o", files / "r", *words)
-    assert sorted(path.name for path in files.iterdir()) == ["list.json"]
+def test_errors_are_one_line(error_of, folder, tmp_path, arguments, message):
+    (tmp_path / "list.json").write_text("[1]", encoding="utf-8")
+    words = [
+        tmp_path / word if "." in word and ":" not in word and not word[0].isdigit() else word for word in arguments
+    ]
+    assert message in error_of("align", "hand", folder / "cloud0.ply", "-o", tmp_path / "r", *words)
+    assert [path.name for path in tmp_path.iterdir()] == ["list.json"]
 
 
 def test_the_side_of_a_hand(done, error_of, folder, tmp_path):
@@ -274,9 +266,7 @@ def test_pictures_of_a_pattern_are_aligned(done, pictures, tmp_path):
     first, second = (tr.load(tmp_path / f"r_{number}.safetensors") for number in (1, 2))
     assert float(second.pose[0] - first.pose[0]) == pytest.approx(0.004, abs=1e-3)
     assert 0.5 < float(first.confidence) <= 1
-    frame = tr.DepthFrame.load(
-        pictures / "depth" / "0.png", pictures / "camera.json", pictures / "masks" / "0.png"
-    )  # fmt: skip
+    frame = tr.DepthFrame.load(pictures / "depth/0.png", pictures / "camera.json", pictures / "masks/0.png")
     assert len(first.distances) == len(frame.points)
 
 

@@ -33,21 +33,6 @@ def clouds(folder):
     return [folder / "robot0.ply", folder / "robot1.ply"]
 
 
-def test_the_base_is_written_as_numbers_for_ros_and_drawn(done, folder, clouds, tmp_path):
-    output = done(
-        "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
-    )  # fmt: skip
-    assert "base within" in output
-    written = json.loads((tmp_path / "base_transform.json").read_text())
-    found = tr.load(tmp_path / "base.safetensors")
-    assert written["T_camera_base"] == found.T_camera_base.tolist()
-    assert "static_transform_publisher --x" in written["ros2"]
-    assert written["ros2"].endswith("--child-frame-id base")
-    assert list(written["offsets"]) == ["shoulder", "rail"]
-    torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
-    assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
-
-
 def transform_of(path):
     """Return the camera's pose in its parent (4, 4), and the parent, of a robot's file."""
     joint = next(joint for joint in ET.parse(path).getroot().iter("joint") if joint.get("name") == "camera_joint")
@@ -58,19 +43,26 @@ def transform_of(path):
     return placed, joint.find("parent").get("link")
 
 
-def test_the_camera_joins_the_robot_in_its_file_and_for_easy_handeye(done, folder, clouds, tmp_path):
-    done(
+def test_the_base_is_written_for_ros_for_easy_handeye_and_into_the_file_of_the_robot(done, folder, clouds, tmp_path):
+    output = done(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base",
         "--urdf-out", tmp_path / "seen.urdf",
     )  # fmt: skip
-    inverse = tr.load(tmp_path / "base.safetensors").T_camera_base.inverse()
+    assert "base within" in output
+    written, found = json.loads((tmp_path / "base_transform.json").read_text()), tr.load(tmp_path / "base.safetensors")
+    assert written["T_camera_base"] == found.T_camera_base.tolist()
+    assert "static_transform_publisher --x" in written["ros2"]
+    assert written["ros2"].endswith("--child-frame-id base")
+    assert list(written["offsets"]) == ["shoulder", "rail"]
+    torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
+    assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
+    inverse = found.T_camera_base.inverse()
     placed, parent = transform_of(tmp_path / "seen.urdf")
     torch.testing.assert_close(placed, inverse)
     assert parent == "base"
     assert tr.ArticulatedShape.from_urdf(tmp_path / "seen.urdf").dof_names[6:] == ("shoulder", "rail")
     written = yaml_numbers(tmp_path / "base_handeye.yaml")
-    assert written["eye_on_hand"] == "false"
-    assert written["robot_base_frame"] == '"base"'
+    assert (written["eye_on_hand"], written["robot_base_frame"]) == ("false", '"base"')
     quaternion = [float(written[name]) for name in ("qx", "qy", "qz", "qw")]
     torch.testing.assert_close(torch.from_numpy(Rotation.from_quat(quaternion).as_matrix()), inverse[:3, :3])
     assert [float(written[name]) for name in "xyz"] == pytest.approx(inverse[:3, 3].tolist())

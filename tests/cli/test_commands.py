@@ -106,8 +106,6 @@ def test_what_writes_names_its_output_and_help_is_in_sentences_with_two_right_ex
     ("words", "message"),
     [
         (("register", "a", "b", "--num-bones", "3"), "No such option: --num-bones; did you mean --bones?"),
-        (("spine", "a", "--num-tips=5"), "No such option: --num-tips; did you mean --tips?"),
-        (("align", "hand", "a", "--serch", "never"), "No such option: --serch; did you mean --search?"),
         (("align", "hand", "a", "--gif", "a.gif"), "No such option: --gif; torchreg export writes it from the result"),
         (("spine", "a", "--seed", "3"), "it gives the same result every time"),
         (("info", "hand", "--qqqq"), "No such option: --qqqq; --help shows all"),
@@ -124,7 +122,7 @@ def test_near_misses_of_options_are_answered(run, words, message):
     ("message", "shown"),
     [
         ('a.ply: 1 of 3 points are not finite; nan_policy="omit" drops them',
-         "a.ply: 1 of 3 points are not finite; nan_policy=\"omit\" drops them"),
+         "a.ply: 1 of 3 points are not finite"),  # `info` reads no clouds: it has no --nan-policy
         ("choose one with skin=NAME: 0 ('a'), 1 ('b')", "choose one with --skin NAME: 0 ('a'), 1 ('b')"),
         ("was not found; name its folder by package_dirs=; it is left out",
          "was not found; name its folder by --package-dir; it is left out"),
@@ -141,9 +139,7 @@ def test_hints_are_options_of_the_command_or_left_out(error_of, monkeypatch, mes
         raise tr.errors.FormatError(message)
 
     monkeypatch.setattr("torchreg.shapes.hand.Hand", failed)
-    # `info` reads no clouds: it has no --nan-policy, and what names it alone is left out.
-    expected = "a.ply: 1 of 3 points are not finite" if "nan_policy" in message else shown
-    assert error_of("info", "hand") == f"torchreg: {expected}"
+    assert error_of("info", "hand") == f"torchreg: {shown}"
 
 
 @pytest.mark.parametrize(
@@ -151,7 +147,6 @@ def test_hints_are_options_of_the_command_or_left_out(error_of, monkeypatch, mes
     [
         (tr.errors.InputError("sigma must be\n  positive"), 2, "torchreg: sigma must be positive\n"),
         (FileNotFoundError(2, "No such file or directory", "a.ply"), 2, "torchreg: a.ply: No such file or directory\n"),
-        (FileNotFoundError("the folder does not exist"), 2, "torchreg: the folder does not exist\n"),
         (KeyboardInterrupt(), 130, "torchreg: interrupted\n"),
         (ZeroDivisionError("a mistake"), 1, ""),  # the program's own keep their traceback
         (BrokenPipeError(32, "Broken pipe"), 1, ""),
@@ -230,9 +225,6 @@ def test_outputs_are_not_overwritten_unless_forced(run, error_of, folder, tmp_pa
 def test_names_of_results_get_their_ending(error_of, tmp_path, given, made):
     (tmp_path / made).touch()
     assert f"{made} exists" in error_of("spine", tmp_path, "-o", tmp_path / given)
-
-
-def test_a_result_is_not_called_like_another_kind_of_file(error_of, tmp_path):
     assert "s5.swc must end in .glb; rename the output" in error_of("spine", tmp_path, "-o", tmp_path / "s5.swc")
 
 
@@ -289,19 +281,15 @@ def test_people_have_names(run, interrupted):
     ("words", "message"),
     [
         (["Hand"], "did you mean 'hand'?"),
-        (["hand-right"], "did you mean 'hand'?"),
         (["left-hand"], "did you mean 'hand-left'?"),
         (["mano_right.pkl"], "from_skinned_mesh"),
         (["robot.xacro"], "URDF"),
         (["foot"], "SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf"),
-        (["scan.ply"], "SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf"),
         (["hand", "--fixed-base"], "--free-base/--fixed-base has no meaning for hand; leave it out"),
-        (["hand-left", "--package-dir", "."], "--package-dir has no meaning for hand-left"),
         (["arm.urdf", "--parents", "a.json"], "--parents has no meaning for "),
         (["flat.glb", "--free-base"], "--free-base/--fixed-base has no meaning for "),
         (["flat.glb", "--parents", "{"], "cannot be read as JSON"),
         (["flat.glb", "--parents", "[" * 100_000], "cannot be read as JSON"),
-        (["flat.glb", "--parents", "[1]"], "must hold {joint: parent or null}"),
         (["flat.glb", "--parents", '{"root": 1}'], "must hold {joint: parent or null}"),
     ],
 )

@@ -156,7 +156,7 @@ def test_archives_and_lists_of_files_are_sequences_too(run, command, whole, tmp_
         assert torch.allclose(tr.load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-5)
 
 
-@pytest.mark.parametrize("frame", [1, 4, 5])
+@pytest.mark.parametrize("frame", [1, 5])
 def test_an_interrupted_run_goes_on_to_the_same_end(run, command, whole, tmp_path, monkeypatch, frame):
     with monkeypatch.context() as patch:
         stop_at(patch, frame)
@@ -177,6 +177,10 @@ def test_an_interrupted_run_goes_on_to_the_same_end(run, command, whole, tmp_pat
 
 
 def test_a_killed_run_goes_on_from_what_was_saved_last(run, command, whole, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_at(patch, 0)
+        assert run(*command()).exit_code == 130
+    assert list(tmp_path.iterdir()) == []
     with monkeypatch.context() as patch:
         stop_at(patch, 5, MemoryError)
         assert isinstance(run(*command("--save-every", 2, *FAST)).exception, MemoryError)
@@ -201,12 +205,6 @@ def test_an_interruption_while_a_frame_is_drawn_leaves_no_hole(run, command, who
     assert run(*command("--pictures", tmp_path / "live", "--resume", *FAST)).exit_code == 0
     assert len(list((tmp_path / "live").iterdir())) == FRAMES
     assert same(tr.load(tmp_path / "r.safetensors"), whole)
-
-
-def test_an_interruption_before_the_first_frame_leaves_nothing(run, command, tmp_path, monkeypatch):
-    stop_at(monkeypatch, 0)
-    assert run(*command()).exit_code == 130
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_frames_that_came_later_are_added(run, command, whole, tmp_path, monkeypatch):
@@ -347,21 +345,16 @@ def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
     ("options", "message"),
     [
         ({"frames": ["none.ply"]}, "none.ply: No such file or directory"),
-        ({"frames": ["start.json"]}, "has the unknown ending '.json'"),
-        (("--start", "none.json"), "none.json: No such file or directory"),
         (("--movie", "avi"), "--movie must be one of gif, mp4, none; got 'avi'"),
         (("--fps", 0), "--fps must be positive"),
         (("--scale", -1), "--scale must be positive"),
         (("--prediction", "maybe"), "prediction must be one of velocity, none"),
-        (("--model-points", "few"), "model_points must be one of seen, data, shape"),
-        (("--nan-policy", "keep"), "nan_policy must be one of raise, omit"),
         (("--points", 0), "num_model_points must be at least 1"),
         (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand"),
         (("--gltf", "a.glb", "--no-gltf"), "--gltf and --no-gltf cannot be used together"),
         (("--poses", "a.txt"), "a.txt must end in .csv"),
         (("--reach", 0.1), "--reach has no meaning without --stereo"),
         (("--depth-range", 1, 2), "--depth-range has no meaning without --stereo or --depth"),
-        (("--depth",), "--depth takes --intrinsics FILE with the camera"),
         ({"out": "no/r"}, "no does not exist; create it first"),
         (("--pictures", "no/live"), "live: No such file or directory"),
     ],
@@ -406,7 +399,6 @@ def test_the_bones_of_a_rig_are_fitted_over_the_frames(folder, run, error_of, tm
     ("member", "content", "message"),
     [
         ("job.json", b"{", "is no progress of a tracker"),
-        ("job.json", b"[]", "must hold a TrackResult, a TrackState and what was to be done"),
         ("job.json", None, "no item named 'job.json'"),
         ("state.json", b"{}", "does not describe tensors"),
         ("state.safetensors", b"", "is damaged"),

@@ -95,22 +95,17 @@ def sized(shape, size):
     return zipped({"points.npy": header(str(shape), "'<f8'", body=b"\0" * size)})
 
 
-BAD = [
+test_damaged_archives = refusing(lambda folder, content: tr.load_points(put(folder, "a.npz", content)), file="a.npz")(
     (archive(one=POINTS, two=POINTS), r"must hold an array 'points' of shape \(N, 3\), .* got one, two"),
-    (archive(world=POINTS, scan=POINTS, faces=[[0, 1, 2]]), "array of that shape; got faces, scan, world"),
-    (archive(other=POINTS[:, :2]), "must hold an array 'points'"),
     (archive(), "got no arrays"),
     (archive(points=POINTS[:, :2]), r"points must have shape \(N, 3\), got \(4, 2\)"),
-    (archive(points=np.float64(3)), r"points must have shape"),
     (archive(points=POINTS, normals=POINTS[:3]), r"normals must have shape \(4, 3\), got \(3, 3\)"),
     (archive(points=POINTS, faces=[[0, 1, 5]]), "a face names vertex 5, outside 0 to 3"),
-    (archive(points=POINTS, faces=[[0, 1, -1]]), "a face names vertex -1, outside 0 to 3"),
     (archive(points=POINTS, faces=[[0, 1]]), r"faces must have shape \(F, 3\)"),
     *((archive(points=POINTS, faces=[[0, 1, bad]]), "faces must be whole numbers") for bad in (1.5, np.nan, np.inf)),
     *((archive(points=POINTS, faces=np.array([[0, 1, value]], kind)), "faces are out of range") for kind, value in (
         ("f8", 2.0**53), ("i8", -(2**53)), ("u8", 2**64 - 1), ("i8", -(2**63))
     )),
-    (archive(points=POINTS, faces=np.array([[0, 1, 2**53 - 1]])), f"a face names vertex {2**53 - 1}"),
     *((archive(points=np.zeros((2, 3), kind)), r"member 'points\.npy' must hold real numbers") for kind in (
         bool, complex, "U4", "M8[s]", [("x", "f4")]
     )),
@@ -119,12 +114,7 @@ BAD = [
         (4, 3, 95), (4, 3, 97), (4, 3, 0), (10**12, 3, 96), (-4, -3, 96), (2**62, 4, 0)
     )),
     *((cut, "is not a readable zip archive") for cut in (b"", b"PK\x03\x04 cut off", archive(points=POINTS)[:-30])),
-]  # fmt: skip
-
-
-test_damaged_archives = refusing(lambda folder, content: tr.load_points(put(folder, "a.npz", content)), file="a.npz")(
-    *BAD
-)
+)  # fmt: skip
 
 
 def test_zip_bombs_and_odd_archives_are_refused_before_expanding():
@@ -155,9 +145,6 @@ def test_numpy_reads_what_is_written(tmp_path):
         np.testing.assert_array_equal(loaded["normals"], points)
         assert (loaded["colors"] == 7).all()
         assert loaded["faces"].tolist() == [[0, 1, 3]]
-    save_points(tmp_path / "a.npz", points)
-    with np.load(tmp_path / "a.npz") as loaded:
-        assert loaded.files == ["points"]
     save_arrays(tmp_path / "a.npz", {"x": torch.arange(6).reshape(2, 3), "flags": torch.tensor([True, False])})
     with np.load(tmp_path / "a.npz") as loaded:
         assert loaded["x"].tolist() == [[0, 1, 2], [3, 4, 5]]

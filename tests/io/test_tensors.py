@@ -8,11 +8,13 @@ import os
 import pytest
 import torch
 
-from tests.io.helpers import refused
+import torchreg as tr
+from tests.io.helpers import put, refused
 from tests.refusing import refusing
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.io.limits import FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
+from torchreg.storage import load_pose
 
 METADATA = {"kind": "align", "steps": [1, 2.5, None, True], "nested": {"é": "ü"}, "sigma": math.inf, "low": -math.inf}
 
@@ -140,3 +142,18 @@ test_what_cannot_be_saved = refusing(lambda folder, *given: save_tensors(folder 
     ({}, {3: 1}, InputTypeError, "metadata must have keys of type str, got 3"),
     ({}, {"$float": 1}, InputError, "reserved"),
 )
+
+
+@pytest.mark.parametrize(
+    "content", [b"[" + b"9" * 4400 + b"]", b"[1e999]", b"[" * 5000, b'{"x": 1' + b"0" * 400 + b"}"]
+)
+def test_poses_in_json_that_are_refused(tmp_path, content):
+    with pytest.raises(tr.errors.TorchregError):
+        load_pose(put(tmp_path, "pose.json", content), tr.Hand())
+
+
+@pytest.mark.parametrize(("poses", "costs"), [((2, 27), (3,)), ((21, 3), (2,)), ((), (2,))])
+def test_results_whose_shapes_do_not_fit_are_refused(tmp_path, poses, costs):
+    tr.PoseStarts(torch.zeros(poses), torch.zeros(costs), torch.ones(())).save(tmp_path / "a.safetensors")
+    with pytest.raises(FormatError, match=r"poses|costs"):
+        tr.load(tmp_path / "a.safetensors")

@@ -72,14 +72,12 @@ def load(folder, text, **options):
 
 def test_tree_is_in_order_with_exact_numbers(tmp_path):
     record = load(tmp_path, ARM)
-    assert record.name == "arm"
-    assert record.link_names == ("base", "upper", "lower", "hand")
+    assert (record.name, record.link_names) == ("arm", ("base", "upper", "lower", "hand"))
     joints = record.tree.joints
-    assert [frame.name for frame in joints] == ["base", "shoulder", "elbow", "wrist"]
-    assert [frame.parent for frame in joints] == [-1, 0, 1, 2]
-    assert [frame.kind for frame in joints] == ["fixed", "revolute", "revolute", "prismatic"]
-    limits = [(frame.lower, frame.upper) for frame in joints[1:]]
-    assert limits == [(-math.inf, math.inf), (-1, 2), (-0.1, 0.2)]
+    assert [(frame.name, frame.parent, frame.kind, frame.lower, frame.upper) for frame in joints[1:]] == [
+        ("shoulder", 0, "revolute", -math.inf, math.inf), ("elbow", 1, "revolute", -1, 2),
+        ("wrist", 2, "prismatic", -0.1, 0.2),
+    ]  # fmt: skip
     assert (joints[2].axis, joints[3].axis) == ((1, 0, 0), (0, 0, 1))
     assert joints[1].axis == pytest.approx((0.5**0.5, 0.5**0.5, 0), abs=1e-15)
     assert joints[1].offset[:3, 3].tolist() == [0.1, 0.2, 0.3]
@@ -237,6 +235,14 @@ def test_size_limits_and_options(tmp_path, monkeypatch):
 
 
 def test_missing_meshes_are_named_or_skipped(tmp_path):
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    for text, words in (
+        (with_mesh("https://example.org/ball.stl"), "is remote"),
+        (with_mesh(""), "its <mesh> has no filename"),
+        (with_mesh("box.stl", "scale='0 1 1'"), "scale of zero"),
+    ):
+        with pytest.warns(FileWarning, match=words):
+            assert load(tmp_path, text).link_meshes == (None,)
     path = put(tmp_path, "m.urdf", with_mesh("gone.stl"))
     refused((lambda: load_urdf(path, meshes="require"), r"visual of link 'a'.*'gone\.stl' was not found"))
     with pytest.warns(FileWarning, match=r"'gone\.stl' was not found .*package_dirs=; it is left out"):
@@ -250,20 +256,6 @@ def test_missing_meshes_are_named_or_skipped(tmp_path):
     put(tmp_path, "gone.stl", "version https://git-lfs.github.com/spec/v1\nsize 1\n")
     with pytest.warns(FileWarning, match=r"gone\.stl is a Git LFS pointer.*it is left out"):
         assert [solid.kind for solid in load(tmp_path, text).link_primitives[0]] == ["box"]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (with_mesh("https://example.org/ball.stl"), "is remote"),
-        (with_mesh(""), "its <mesh> has no filename"),
-        (with_mesh("box.stl", "scale='0 1 1'"), "scale of zero"),
-    ],
-)
-def test_meshes_that_cannot_be_are_left_out(tmp_path, text, words):
-    trimesh.creation.box().export(tmp_path / "box.stl")
-    with pytest.warns(FileWarning, match=words):
-        assert load(tmp_path, text).link_meshes == (None,)
 
 
 @pytest.fixture
@@ -322,15 +314,13 @@ def test_files_are_read_once_and_scenes_are_put_together(folder):
     np.testing.assert_allclose(two.bounds()[:, 0], [-0.5, 3.5], atol=1e-6)
 
 
-def test_collada_needs_its_extra(folder, monkeypatch):
+def test_collada_comes_in_metres_and_without_its_looks(folder, monkeypatch):
     put(folder, "box.dae", b"<COLLADA/>")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    words = r"a: .*torchreg-articulated\[urdf\]"
-    refused((lambda: mesh(folder, "box.dae"), words), error=tr.errors.MissingExtraError)
-    assert mesh(folder, "box.dae", require=False) is None
-
-
-def test_collada_comes_in_metres_and_without_its_looks(folder):
+    with monkeypatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda name: None)
+        words = r"a: .*torchreg-articulated\[urdf\]"
+        refused((lambda: mesh(folder, "box.dae"), words), error=tr.errors.MissingExtraError)
+        assert mesh(folder, "box.dae", require=False) is None
     pytest.importorskip("collada")
     content = trimesh.exchange.dae.export_collada(trimesh.creation.box())
     broken = content.replace(b"<library_effects>", b"<library_effects><effect id='x'><profile_COMMON/></effect>", 1)
@@ -349,19 +339,19 @@ def test_collada_comes_in_metres_and_without_its_looks(folder):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("bad.stl", b"solid nothing", r"bad\.stl: must hold 84 \+ 50 x 0 bytes"),
-        ("far.obj", b"v 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n", r"far\.obj: a face names a vertex outside 1 to 3"),
-        ("empty.obj", b"v 0 0 0\n", r"empty\.obj: holds 1 points but no faces"),
-        ("bad.off", b"OFF\n8 6 0\n", r"bad\.off: the header says 8 vertices and 6 faces"),
-        ("bad.glb", b"glTF", r"bad\.glb: is cut off in its header"),
-        ("mesh.fbx", b"x", r"mesh\.fbx: is of a format that is not read .*export it as glTF"),
-    ],
+def reading(folder, name, content):
+    """Return the mesh of a damaged file, which is refused also where a missing one is left out."""
+    path = put(folder, name, content)
+    with pytest.raises(FormatError):
+        mesh(folder, path.name, require=False)
+    return mesh(folder, path.name)
+
+
+test_damaged_meshes = refusing(reading)(
+    ("bad.stl", b"solid nothing", r"bad\.stl: must hold 84 \+ 50 x 0 bytes"),
+    ("far.obj", b"v 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n", r"far\.obj: a face names a vertex outside 1 to 3"),
+    ("empty.obj", b"v 0 0 0\n", r"empty\.obj: holds 1 points but no faces"),
+    ("bad.off", b"OFF\n8 6 0\n", r"bad\.off: the header says 8 vertices and 6 faces"),
+    ("bad.glb", b"glTF", r"bad\.glb: is cut off in its header"),
+    ("mesh.fbx", b"x", r"mesh\.fbx: is of a format that is not read .*export it as glTF"),
 )
-@pytest.mark.parametrize("require", [True, False])
-def test_damaged_meshes_are_refused_though_missing_ones_may_be_left_out(folder, name, content, words, require):
-    put(folder, name, content)
-    with pytest.raises(FormatError, match=words):
-        mesh(folder, name, require=require)

@@ -53,10 +53,7 @@ DEFAULT_LIMITS = FileLimits()
 
 @dataclass(frozen=True)
 class FileBudget:
-    """What a file may ask for beyond `FileLimits`, such that none below 10 MB takes 500 MB or 3 s.
-
-    Pictures have their limits in `torchreg.geometry.budget`, for what their pixels need.
-    """
+    """What a file may ask for beyond `FileLimits`, such that none below 10 MB takes 500 MB or 3 s."""
 
     # Frames of one archive: an hour at 25 per second.
     frames: int = 100_000

@@ -299,10 +299,7 @@ def _rows(values: Array, what: str, count: int | None) -> Tensor:
 
 
 def _unit_colors(colors: Array) -> Array | None:
-    """Return colors from 0 to 1; None, with a warning, if the numbers can be none.
-
-    Bytes are bytes. Other numbers are told by their range, as many programs write bytes as floats or wide integers.
-    """
+    """Return colors from 0 to 1, by the range of the numbers if not bytes; None, with a warning, if they are none."""
     if colors.dtype == np.uint8:
         return colors / 255.0
     known = colors[np.isfinite(colors)] if colors.dtype.kind == "f" else colors

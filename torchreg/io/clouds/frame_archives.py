@@ -113,10 +113,7 @@ def _frames_in(archive: zipfile.ZipFile) -> FrameArchive | None:
 
 
 def _numbered(shapes: dict[str, tuple[int, ...]]) -> list[str]:
-    """Return the names of arrays that number the frames, in their order: frame_0, frame_1, ...
-
-    As numpy calls those of a list arr_0, arr_1, ..., any other name will do if there is one such sequence of (M, 3).
-    """
+    """Return the names of arrays that number frames (frame_0, ...; numpy: arr_0, ...), in order, of (M, 3) each."""
     sequences = dict[str, dict[int, str]]()
     for key in shapes:
         if match := _NUMBERED.fullmatch(key):
