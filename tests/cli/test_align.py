@@ -9,6 +9,7 @@ import torch
 import torchreg as tr
 import torchreg.alignment.align as align_module
 from tests.cli.conftest import depth_of, save_cameras, save_depth, save_picture
+from tests.tables import each_row
 from torchreg.io.points import save_points
 
 QUICK = ("--search", "never")
@@ -125,14 +126,6 @@ def test_options_reach_the_alignment(run, error_of, folder, tmp_path, interrupte
     assert "--upright is of a search" in error_of(*upright, "--start", folder / "truth0.json")
 
 
-def test_millimeters_taken_for_meters_are_warned_of(run, folder, tmp_path):
-    save_points(tmp_path / "mm.ply", 1000 * tr.load_points(folder / "cloud0.ply").points)
-    answer = run("align", "hand", tmp_path / "mm.ply", "-o", tmp_path / "r", *QUICK)
-    assert answer.exit_code == 1, answer.output
-    assert "torchreg: warning: the data spread over" in answer.output
-    assert tr.load(tmp_path / "r.safetensors").status is tr.Status.FEW_INLIERS
-
-
 def test_points_that_are_not_finite_are_refused_or_left_out(run, error_of, folder, tmp_path):
     points = tr.load_points(folder / "cloud0.ply").points.tolist()
     (tmp_path / "c.xyz").write_text("nan 0 0\n" + "\n".join(" ".join(map(str, point)) for point in points))
@@ -196,24 +189,21 @@ def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of
     assert "--rig has no meaning for hand" in error_of(*hand)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("none.ply",), "none.ply: No such file or directory"),
-        (("--start", "list.json"), "list.json must have shape (27)"),
-        (("--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
-        (("--sigma", "0.01:0.02:5"), "stop must not exceed start"),
-        (("--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
-        (("--scale", "0"), "--scale must be positive and finite, got 0.0"),
-        (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand; leave it out"),
-        (("-o", "no/r.x"), "no does not exist; create it first"),
-        (("--picture", "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
-        (("--pose", "r.json"), "two outputs would be called"),
-        (("--ply", "r.obj"), "r.obj must end in .ply"),
-        (("--side", "up"), "--side must be one of right, left, either"),
-        (("--intrinsics", "list.json"), "--intrinsics has no meaning without --depth"),
-        (("--depth",), "--depth takes --intrinsics FILE with the camera"),
-    ],
+@each_row(
+    (("none.ply",), "none.ply: No such file or directory"),
+    (("--start", "list.json"), "list.json must have shape (27)"),
+    (("--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
+    (("--sigma", "0.01:0.02:5"), "stop must not exceed start"),
+    (("--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
+    (("--scale", "0"), "--scale must be positive and finite, got 0.0"),
+    (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand; leave it out"),
+    (("-o", "no/r.x"), "no does not exist; create it first"),
+    (("--picture", "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
+    (("--pose", "r.json"), "two outputs would be called"),
+    (("--ply", "r.obj"), "r.obj must end in .ply"),
+    (("--side", "up"), "--side must be one of right, left, either"),
+    (("--intrinsics", "list.json"), "--intrinsics has no meaning without --depth"),
+    (("--depth",), "--depth takes --intrinsics FILE with the camera"),
 )
 def test_errors_are_one_line(error_of, folder, tmp_path, arguments, message):
     (tmp_path / "list.json").write_text("[1]", encoding="utf-8")

@@ -18,19 +18,22 @@ BASE[:3, :3] = torch.from_numpy(Rotation.from_rotvec([1.7, 0.3, -0.2]).as_matrix
 BASE[:3, 3] = torch.tensor([0.1, 0.2, 1.1])
 
 
+def write_clouds(folder, robot, link=0):
+    """Write two clouds of the robot's side towards a camera that a link carries, and the table of its joints."""
+    arm = tr.ArticulatedShape.from_urdf(robot)
+    skin, files = arm.file_skin(), [folder / "robot0.ply", folder / "robot1.ply"]
+    for file, joints in zip(files, [(0.6, 0.05), (-0.9, 0.2)], strict=True):
+        pose = torch.tensor([0.0] * 6 + list(joints))
+        to_camera = BASE @ arm.part_transforms(pose)[link].inverse()
+        vertices = skin(pose) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        save_points(file, sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0])
+    (folder / "joints.csv").write_text("shoulder,rail,time\n0.6,0.05,0\n-0.9,0.2,1\n")
+    return files
+
+
 @pytest.fixture(scope="module")
 def clouds(folder):
-    """Two clouds of the robot's side towards the camera, and the table of its joints."""
-    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
-    skin = arm.file_skin()
-    lines = ["shoulder,rail,time"]
-    for number, (shoulder, rail) in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
-        vertices = skin(torch.tensor([0.0] * 6 + [shoulder, rail])) @ BASE[:3, :3].T + BASE[:3, 3]
-        points = sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
-        save_points(folder / f"robot{number}.ply", points)
-        lines.append(f"{shoulder},{rail},{number}")
-    (folder / "joints.csv").write_text("\n".join(lines) + "\n")
-    return [folder / "robot0.ply", folder / "robot1.ply"]
+    return write_clouds(folder, folder / "arm.urdf")
 
 
 def transform_of(path):
@@ -69,17 +72,7 @@ def test_the_base_is_written_for_ros_for_easy_handeye_and_into_the_file_of_the_r
 
 
 def test_a_camera_on_a_link_joins_this_link(done, folder, tmp_path):
-    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
-    skin, files = arm.file_skin(), []
-    for number, joints in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
-        pose = torch.tensor([0.0] * 6 + list(joints))
-        to_camera = BASE @ arm.part_transforms(pose)[1].inverse()
-        vertices = skin(pose) @ to_camera[:3, :3].T + to_camera[:3, 3]
-        save_points(
-            tmp_path / f"{number}.ply", sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
-        )
-        files.append(tmp_path / f"{number}.ply")
-    (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.9,0.2\n")
+    files = write_clouds(tmp_path, folder / "arm.urdf", 1)
     done(
         "calibrate", folder / "arm.urdf", *files, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base",
         "--camera-link", "upper", "--urdf-out", tmp_path / "seen.urdf",
@@ -122,17 +115,16 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     robot, output = folder / "arm.urdf", ["-o", tmp_path / "out"]
     table = tmp_path / "joints.csv"
     assert "takes --joints TABLE.csv" in error_of("calibrate", robot, *clouds, *output)
-    table.write_text("shoulder,arm\n0.1,0.2\n0.1,0.2\n")
-    named = error_of("calibrate", robot, *clouds, "--joints", table, *output)
-    assert "has no column rail; the robot's joints are shoulder, rail" in named
-    table.write_text("shoulder,rail\n0.1,0.2\n")
-    assert "a row for every frame, 2, got 1" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
-    table.write_text("shoulder,rail\n34.0,0.2\n-50.0,0.2\n")
-    assert "as degrees all would fit" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
-    hand = error_of("calibrate", "hand", *clouds, "--joints", table, *output)
-    assert "--joints has no meaning without a robot" in hand
-    masks = error_of("calibrate", robot, *clouds, "--joints", table, "--mask", table, *output)
-    assert "--mask has no meaning without --depth" in masks
+    for rows, message in (
+        ("shoulder,arm\n0.1,0.2\n0.1,0.2\n", "has no column rail; the robot's joints are shoulder, rail"),
+        ("shoulder,rail\n0.1,0.2\n", "a row for every frame, 2, got 1"),
+        ("shoulder,rail\n34.0,0.2\n-50.0,0.2\n", "as degrees all would fit"),
+    ):
+        table.write_text(rows)
+        assert message in error_of("calibrate", robot, *clouds, "--joints", table, *output)
+    given = *clouds, "--joints", table, *output
+    assert "--joints has no meaning without a robot" in error_of("calibrate", "hand", *given)
+    assert "--mask has no meaning without --depth" in error_of("calibrate", robot, *given, "--mask", table)
 
 
 def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(done, folder, tmp_path, monkeypatch):

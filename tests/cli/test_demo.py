@@ -8,9 +8,11 @@ import torchreg as tr
 from torchreg.datasets.hand import hand_motion
 
 
-def test_the_demonstration_runs(run, done, tmp_path):
+def test_the_demonstration_runs(run, tmp_path):
     out = tmp_path / "made" / "demo"
-    lines = done("demo", "--frames", "3", "-o", out).splitlines()
+    answer = run("demo", "--frames", "3", "-o", out)
+    assert answer.exit_code == 0, answer.output
+    lines = answer.stdout.splitlines()
     names = ["hand.glb", "poses.json", "track.json", "track.safetensors", "tracking.gif"]
     assert sorted(path.name for path in out.iterdir()) == names
     result = tr.load(out / "track.safetensors")

@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 
 import torchreg as tr
+from tests.tables import each_row
 
 
 @pytest.fixture(scope="module")
@@ -101,50 +102,37 @@ def arrays(path):
         return {name: archive[name] for name in archive.files}
 
 
-@pytest.mark.parametrize(
-    ("name", "file", "options", "check"),
-    [
-        ("aligned0", "a.json", (), is_pose),
-        ("aligned0", "a.csv", (), is_table_of_poses),
-        ("aligned0", "a.ply", (), lambda found, path: holds(path, found.registered)[0]),
-        ("aligned0", "a.glb", (), moves),
-        ("aligned0", "a.png", ("cloud0.ply",), is_drawn),
-        ("aligned0", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["pose"], found.pose)),
-        (
-            "tracked",
-            "a.json",
-            (),
-            lambda found, path: json.loads(path.read_text())["poses"]["base_x"] == found.poses[:, 0].tolist(),
-        ),
-        ("tracked", "a.csv", (), is_table_of_frames),
-        ("tracked", "a.glb", (), moves),
-        ("tracked", "a.bvh", (), lambda found, path: "Frames: 3" in path.read_text(encoding="utf-8")),
-        (
-            "tracked",
-            "a.gif",
-            ("cloud0.ply", "cloud1.ply", "cloud0.ply"),
-            lambda f, path: read_picture(path) == (3, True),
-        ),
-        ("tracked", "a.png", (), is_drawn),
-        (
-            "tracked",
-            "a",
-            ("cloud0.ply", "cloud1.ply", "cloud0.ply"),
-            lambda found, path: len(list(path.iterdir())) == 3,
-        ),
-        ("spine", "a.swc", (), is_swc),
-        ("spine", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["tips"], found.tips)),
-        ("spine", "a.csv", (), lambda found, path: read_table(path)[0][:2] == ["time", "length_0"]),
-        ("spine", "a.png", (), is_drawn),
-        ("spine", "a.glb", ("",), moves),
-        ("spine", "a.gif", ("",), lambda found, path: read_picture(path) == (3, True)),
-        ("spine", "a", ("",), lambda found, path: len(list(path.iterdir())) == 3),
-        ("scan", "a.ply", (), lambda found, path: holds(path, found.deformed) == (True, True)),
-        ("scan", "a.glb", (), moves),
-        ("scan", "a.png", (), is_drawn),
-        ("scan", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["deformed"], found.deformed)),
-        ("size", "a.glb", (), lambda found, path: len(trimesh.load_scene(path).geometry) == 3),
-    ],
+@each_row(
+    ("aligned0", "a.json", (), is_pose),
+    ("aligned0", "a.csv", (), is_table_of_poses),
+    ("aligned0", "a.ply", (), lambda found, path: holds(path, found.registered)[0]),
+    ("aligned0", "a.glb", (), moves),
+    ("aligned0", "a.png", ("cloud0.ply",), is_drawn),
+    ("aligned0", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["pose"], found.pose)),
+    (
+        "tracked",
+        "a.json",
+        (),
+        lambda found, path: json.loads(path.read_text())["poses"]["base_x"] == found.poses[:, 0].tolist(),
+    ),
+    ("tracked", "a.csv", (), is_table_of_frames),
+    ("tracked", "a.glb", (), moves),
+    ("tracked", "a.bvh", (), lambda found, path: "Frames: 3" in path.read_text(encoding="utf-8")),
+    ("tracked", "a.gif", ("cloud0.ply", "cloud1.ply", "cloud0.ply"), lambda f, path: read_picture(path) == (3, True)),
+    ("tracked", "a.png", (), is_drawn),
+    ("tracked", "a", ("cloud0.ply", "cloud1.ply", "cloud0.ply"), lambda found, path: len(list(path.iterdir())) == 3),
+    ("spine", "a.swc", (), is_swc),
+    ("spine", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["tips"], found.tips)),
+    ("spine", "a.csv", (), lambda found, path: read_table(path)[0][:2] == ["time", "length_0"]),
+    ("spine", "a.png", (), is_drawn),
+    ("spine", "a.glb", ("",), moves),
+    ("spine", "a.gif", ("",), lambda found, path: read_picture(path) == (3, True)),
+    ("spine", "a", ("",), lambda found, path: len(list(path.iterdir())) == 3),
+    ("scan", "a.ply", (), lambda found, path: holds(path, found.deformed) == (True, True)),
+    ("scan", "a.glb", (), moves),
+    ("scan", "a.png", (), is_drawn),
+    ("scan", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["deformed"], found.deformed)),
+    ("size", "a.glb", (), lambda found, path: len(trimesh.load_scene(path).geometry) == 3),
 )
 def test_every_ending_is_written(done, results, starfish, folder, tmp_path, name, file, options, check):
     place = starfish if name == "spine" else folder
@@ -184,20 +172,17 @@ def test_shapes_that_a_result_left_out_are_given(run, error_of, results, tmp_pat
     assert (tmp_path / "a.bvh").read_bytes() == (tmp_path / "b.bvh").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("scan", "-o", "a.bvh"), "a ScanRegistration is not written as .bvh, but as .gif, .glb, .mp4, .npz, .pdf"),
-        (("scan", "-o", "a"), "a ScanRegistration is not written as FOLDER"),
-        (("tracked", "-o", "a.gif"), "a.gif needs what the result does not hold; pass --data with what was measured"),
-        (("spine", "-o", "a.glb"), "a.glb needs what the result does not hold; pass --data"),
-        (("aligned0", "-o", "a.png"), "a.png needs what the result does not hold; pass --data"),
-        (("aligned0", "-o", "aligned0.json", "--force"), "aligned0.json is a part of the result"),
-        (("aligned0", "-o", "a.csv", "--fps", "0"), "--fps must be positive"),
-        (("scan", "-o", "a.ply", "--color", "red"), "--color must be one of bones, distance"),
-        (("nothing", "-o", "a.csv"), "nothing.safetensors: No such file"),
-        (("aligned0", "-o", "spine.json"), "spine.json exists; pass --force"),
-    ],
+@each_row(
+    (("scan", "-o", "a.bvh"), "a ScanRegistration is not written as .bvh, but as .gif, .glb, .mp4, .npz, .pdf"),
+    (("scan", "-o", "a"), "a ScanRegistration is not written as FOLDER"),
+    (("tracked", "-o", "a.gif"), "a.gif needs what the result does not hold; pass --data with what was measured"),
+    (("spine", "-o", "a.glb"), "a.glb needs what the result does not hold; pass --data"),
+    (("aligned0", "-o", "a.png"), "a.png needs what the result does not hold; pass --data"),
+    (("aligned0", "-o", "aligned0.json", "--force"), "aligned0.json is a part of the result"),
+    (("aligned0", "-o", "a.csv", "--fps", "0"), "--fps must be positive"),
+    (("scan", "-o", "a.ply", "--color", "red"), "--color must be one of bones, distance"),
+    (("nothing", "-o", "a.csv"), "nothing.safetensors: No such file"),
+    (("aligned0", "-o", "spine.json"), "spine.json exists; pass --force"),
 )
 def test_what_is_missing_is_named(error_of, results, words, message):
     before = sorted(results.iterdir())

@@ -9,6 +9,8 @@ import torch
 import torchreg as tr
 from experiments.made_up.pictures import camera_ring
 from tests.cli.conftest import depth_of, save_cameras, save_picture
+from tests.tables import each_row
+from torchreg.cli.writers import Source
 from torchreg.io.points import save_points
 
 SMALL = ("--tips", 5, "--samples", 12, "--workers", 1)
@@ -84,21 +86,18 @@ def test_files_are_put_in_order_and_work_goes_on(run, starfish, tmp_path):
     assert len(list((tmp_path / "kept").glob("*.safetensors"))) == 3
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["x.npz"], "x.npz: No such file"),
-        (["--swc", "a.txt"], "must end in .swc"),
-        (["--movie", "a.txt"], "must end in .gif, .mp4"),
-        (["--tips", 9], "num_tips must be what a frame shows"),
-        (["--fps", 0], "--fps must be positive"),
-        (["--support", "cut"], "auto, keep"),
-        (["--growing", "--tips", 5], "--growing cannot be used with --tips"),
-        (["--growing", "--prior", "a.swc"], "--growing cannot be used with --prior"),
-        (["--resolution", 64], "--resolution has no meaning without --silhouettes"),
-        (["--silhouettes"], "--silhouettes takes --calibration"),
-        (["-o", "frame2.ply/a.glb"], "frame2.ply does not exist; create it first"),
-    ],
+@each_row(
+    (["x.npz"], "x.npz: No such file"),
+    (["--swc", "a.txt"], "must end in .swc"),
+    (["--movie", "a.txt"], "must end in .gif, .mp4"),
+    (["--tips", 9], "num_tips must be what a frame shows"),
+    (["--fps", 0], "--fps must be positive"),
+    (["--support", "cut"], "auto, keep"),
+    (["--growing", "--tips", 5], "--growing cannot be used with --tips"),
+    (["--growing", "--prior", "a.swc"], "--growing cannot be used with --prior"),
+    (["--resolution", 64], "--resolution has no meaning without --silhouettes"),
+    (["--silhouettes"], "--silhouettes takes --calibration"),
+    (["-o", "frame2.ply/a.glb"], "frame2.ply does not exist; create it first"),
 )
 def test_errors_take_one_line(error_of, starfish, tmp_path, options, message):
     given = [tmp_path / word if "." in str(word) else word for word in options]
@@ -140,12 +139,8 @@ def test_tips_that_may_grow(done, starfish, tmp_path):
     assert tr.load(tmp_path / "a.safetensors").births.tolist() == [0] * 5
 
 
-@pytest.mark.parametrize("origin", [None, (4.0e5, -5.0e6, 30.0)])
-def test_mesh_of_a_picture_begins_at_the_origin(origin):
-    from torchreg.cli.writers import Source
-
-    near = tr.TriangleMesh(torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
-    origin = None if origin is None else torch.tensor(origin, dtype=torch.float64)
-    far = tr.TriangleMesh(near.vertices + (0.0 if origin is None else origin), near.faces)
-    mesh = Source([SimpleNamespace(origin=origin)]).about_origin(far)
-    torch.testing.assert_close(mesh.vertices, near.vertices, atol=1e-8, rtol=0.0)
+def test_mesh_of_a_picture_begins_at_the_origin():
+    near, origin = torch.eye(3, dtype=torch.float64), torch.tensor([4.0e5, -5.0e6, 30.0], dtype=torch.float64)
+    for begin, vertices in ((None, near), (origin, near + origin)):
+        mesh = Source([SimpleNamespace(origin=begin)]).about_origin(tr.TriangleMesh(vertices, [[0, 1, 2]]))
+        torch.testing.assert_close(mesh.vertices, near, atol=1e-8, rtol=0.0)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.tables import each_row
 from torchreg.io.points import save_points
 
 pytest.importorskip("viser", reason="the viewer needs viser")
@@ -37,16 +38,11 @@ def test_a_result_is_served_until_interrupted(done, result, monkeypatch, interru
     assert opened[0].startswith("http://127.0.0.1:")
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["starts", "--html", "a.html"], "shape must be given"),
-        (["starts", "--up", "w"], "--up must be one of"),
-        (["starts", "--html", "a.txt"], "must end in"),
-        (["starts", "--fixed-base"], "about a --shape"),
-        (["nowhere", "--shape", "hand"], "nowhere"),
-    ],
-)
+@each_row(
+    (["starts", "--html", "a.html"], "shape must be given"), (["starts", "--up", "w"], "--up must be one of"),
+    (["starts", "--html", "a.txt"], "must end in"), (["starts", "--fixed-base"], "about a --shape"),
+    (["nowhere", "--shape", "hand"], "nowhere"),
+)  # fmt: skip
 def test_what_does_not_fit_is_refused(error_of, result, tmp_path, words, message):
     given = [tmp_path / word if "." in word else word for word in words[1:]]
     assert message in error_of("view", result / words[0], *given)

@@ -11,7 +11,7 @@ import torch
 
 import torchreg as tr
 from tests.io.helpers import put, read, refused
-from tests.refusing import refusing
+from tests.tables import each, refusing
 from torchreg.io.clouds.npz import save_arrays
 from torchreg.io.images import load_depth, load_mask
 from torchreg.io.limits import FileLimits, open_zip
@@ -167,13 +167,10 @@ def test_arrays_of_maps_of_columns_and_of_fields(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        header()[:60], header()[:9], header("(-2, -3)"), header("(True, 6)"), header("(2, 3.0)"), header("[2, 3]"),
-        header(descr="[('x', '<f4')]"), header(descr="('<f4', (2,))"), header(descr="'O'"), header(descr="'nonsense'"),
-        header(order="None"), header(more="'x': 1"), header("(2, 3"), header("(2, 3)" + "+1" * 40),
-    ],
+@each(
+    header()[:60], header()[:9], header("(-2, -3)"), header("(True, 6)"), header("(2, 3.0)"), header("[2, 3]"),
+    header(descr="[('x', '<f4')]"), header(descr="('<f4', (2,))"), header(descr="'O'"), header(descr="'nonsense'"),
+    header(order="None"), header(more="'x': 1"), header("(2, 3"), header("(2, 3)" + "+1" * 40),
 )  # fmt: skip
 def test_headers_of_arrays_are_no_python(tmp_path, content):
     path = put(tmp_path, "a.npy", content)

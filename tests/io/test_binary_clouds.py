@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import torchreg as tr
 from tests.io.helpers import read, refused
-from tests.refusing import refusing, swap
+from tests.tables import each, refusing, swap
 from torchreg.io.clouds.pcd import decompress_lzf
 from torchreg.io.clouds.raw_cloud import fan_triangles, strip_triangles
 from torchreg.io.limits import FileLimits
@@ -336,20 +336,12 @@ def stl_text(triangles=TRIANGLES, name="part"):
     return "\n".join([*lines, f"endsolid {name}", ""])
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        stl(),
-        stl(header=b"solid facet, but binary", attribute=0xFFFF),
-        stl_text(),
-        stl_text(name=""),
-        stl_text().replace("\n", "\r\n").upper(),
-        "\n \t" + stl_text().replace("    ", "\t") + "\n\n",
-        stl_text().replace("1.0", "+10.0E-1"),
-        stl_text(TRIANGLES[:1], "one") + stl_text(TRIANGLES[1:], "two"),
-        stl_text(name="p\xfcrt").encode("latin-1"),
-    ],
-)
+@each(
+    stl(), stl(header=b"solid facet, but binary", attribute=0xFFFF), stl_text(), stl_text(name=""),
+    stl_text().replace("\n", "\r\n").upper(), "\n \t" + stl_text().replace("    ", "\t") + "\n\n",
+    stl_text().replace("1.0", "+10.0E-1"), stl_text(TRIANGLES[:1], "one") + stl_text(TRIANGLES[1:], "two"),
+    stl_text(name="p\xfcrt").encode("latin-1"),
+)  # fmt: skip
 def test_corners_of_stl_are_joined_in_order_of_first_occurrence(tmp_path, content):
     cloud = read(tmp_path, "a.stl", content)
     assert cloud.points.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import torchreg as tr
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import each_row, refusing
 from torchreg.io.calibration import load_depth_camera, save_cameras, save_depth_camera
 from torchreg.io.cameras.colmap import save_colmap
 from torchreg.io.cameras.opencv_yaml import load_opencv, save_opencv
@@ -134,16 +134,13 @@ def colmap(folder, cameras=CAMERA, images=IMAGES):
     return put(folder, "images.txt", images).parent
 
 
-@pytest.mark.parametrize(
-    ("line", "values"),
-    [
-        (CAMERA, [600, 601, 319.5, 239.5, 0.1, 0.2, 0.001, 0.002]),
-        ("7 SIMPLE_PINHOLE 640 480 600 320 240", [600, 600, 319.5, 239.5, 0, 0, 0, 0]),
-        ("7 PINHOLE 640 480 600 601 320 240", [600, 601, 319.5, 239.5, 0, 0, 0, 0]),
-        ("7 SIMPLE_RADIAL 640 480 600 320 240 0.1", [600, 600, 319.5, 239.5, 0.1, 0, 0, 0]),
-        ("7 RADIAL 640 480 600 320 240 0.1 0.2", [600, 600, 319.5, 239.5, 0.1, 0.2, 0, 0]),
-        ("7 FULL_OPENCV 640 480 600 601 320 240 1 2 3 4 5 6 7 8", [600, 601, 319.5, 239.5, 1, 2, 3, 4]),
-    ],
+@each_row(
+    (CAMERA, [600, 601, 319.5, 239.5, 0.1, 0.2, 0.001, 0.002]),
+    ("7 SIMPLE_PINHOLE 640 480 600 320 240", [600, 600, 319.5, 239.5, 0, 0, 0, 0]),
+    ("7 PINHOLE 640 480 600 601 320 240", [600, 601, 319.5, 239.5, 0, 0, 0, 0]),
+    ("7 SIMPLE_RADIAL 640 480 600 320 240 0.1", [600, 600, 319.5, 239.5, 0.1, 0, 0, 0]),
+    ("7 RADIAL 640 480 600 320 240 0.1 0.2", [600, 600, 319.5, 239.5, 0.1, 0.2, 0, 0]),
+    ("7 FULL_OPENCV 640 480 600 601 320 240 1 2 3 4 5 6 7 8", [600, 601, 319.5, 239.5, 1, 2, 3, 4]),
 )
 def test_models_of_colmap_become_cameras_in_our_convention(tmp_path, line, values):
     cameras = tr.load_cameras(colmap(tmp_path, line + "\n"))

@@ -10,7 +10,7 @@ import torch
 
 import torchreg as tr
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import each, each_row, refusing
 from torchreg.io.calibration import load_depth_camera
 
 FileWarning, FormatError = tr.errors.FileWarning, tr.errors.FormatError
@@ -39,22 +39,19 @@ def saved(tmp_path, content, name="camera.json"):
     return put(tmp_path, name, content)
 
 
-@pytest.mark.parametrize(
-    "entry",
-    [
-        SIZE | {"intrinsic_matrix": COLUMNS},
-        SIZE | {"intrinsic_matrix": COLUMNS, "color_mode": "MJPG_720P", "serial_number_": "1", "stream_length_usec": 9},
-        {"class_name": "PinholeCameraParameters", "intrinsic": SIZE | {"intrinsic_matrix": COLUMNS}},
-        SIZE | {"ppx": 31.5, "ppy": 23.5, "fx": 60.0, "fy": 61.0, "model": "distortion.inverse_brown_conrady",
-                "coeffs": [0.0] * 5},
-        PLAIN | {"blur_score": 71.2, "timestamp": 1234567, "neighbors": [1, 2], "center_depth": 1.0},
-        {"w": 64, "h": 48, "K": COLUMNS, "fps": 30},
-        {"w": 64.0, "h": 48.0, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.5, "cy": 23.5, "camera_angle_x": 0.98},
-        {"image_width": 64, "image_height": 48, "K": ROWS, "D": [0.0] * 5, "distortion_model": "plumb_bob",
-         "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [*ROWS, 0, 0, 0]},
-        SIZE | {"camera_matrix": np.array(ROWS).reshape(3, 3).tolist(), "dist_coeffs": []},
-        SIZE | {"intrinsics": WANTED},
-    ],
+@each(
+    SIZE | {"intrinsic_matrix": COLUMNS},
+    SIZE | {"intrinsic_matrix": COLUMNS, "color_mode": "MJPG_720P", "serial_number_": "1", "stream_length_usec": 9},
+    {"class_name": "PinholeCameraParameters", "intrinsic": SIZE | {"intrinsic_matrix": COLUMNS}},
+    SIZE | {"ppx": 31.5, "ppy": 23.5, "fx": 60.0, "fy": 61.0, "model": "distortion.inverse_brown_conrady",
+            "coeffs": [0.0] * 5},
+    PLAIN | {"blur_score": 71.2, "timestamp": 1234567, "neighbors": [1, 2], "center_depth": 1.0},
+    {"w": 64, "h": 48, "K": COLUMNS, "fps": 30},
+    {"w": 64.0, "h": 48.0, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.5, "cy": 23.5, "camera_angle_x": 0.98},
+    {"image_width": 64, "image_height": 48, "K": ROWS, "D": [0.0] * 5, "distortion_model": "plumb_bob",
+     "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [*ROWS, 0, 0, 0]},
+    SIZE | {"camera_matrix": np.array(ROWS).reshape(3, 3).tolist(), "dist_coeffs": []},
+    SIZE | {"intrinsics": WANTED},
 )  # fmt: skip
 def test_json_of_other_programs(tmp_path, entry):
     path = saved(tmp_path, entry)
@@ -130,30 +127,24 @@ def test_lenses_of_other_kinds_are_refused(tmp_path, model):
         refused((lambda path=path: tr.load_cameras(path), rf"camera\.yml: .*{words}"))
 
 
-@pytest.mark.parametrize(
-    "entry",
-    [
-        PLAIN | {"camera_type": "fisheye", "D": FISHEYE},
-        PLAIN | {"type": "KannalaBrandt8", "coeffs": FISHEYE},
-        PLAIN | {"camera_model": "OPENCV_FISHEYE"} | K4,
-        PLAIN | {"camera_model": "OPENCV_FISHEYE"},  # without numbers it is still no pinhole
-        PLAIN | K4,
-        PLAIN | {"xi": 1.2, "D": FISHEYE},
-        PLAIN | {"lens": {"model": "fisheye", "k": FISHEYE}},
-        PLAIN | {"intrinsics": PLAIN | {"camera_type": "ds"}},
-    ],
+@each(
+    PLAIN | {"camera_type": "fisheye", "D": FISHEYE},
+    PLAIN | {"type": "KannalaBrandt8", "coeffs": FISHEYE},
+    PLAIN | {"camera_model": "OPENCV_FISHEYE"} | K4,
+    PLAIN | {"camera_model": "OPENCV_FISHEYE"},  # without numbers it is still no pinhole
+    PLAIN | K4,
+    PLAIN | {"xi": 1.2, "D": FISHEYE},
+    PLAIN | {"lens": {"model": "fisheye", "k": FISHEYE}},
+    PLAIN | {"intrinsics": PLAIN | {"camera_type": "ds"}},
 )
 def test_lenses_are_named_in_many_ways(tmp_path, entry):
     with pytest.raises(FormatError, match=r"camera\.json.*is not a pinhole camera's"):
         tr.load_cameras(saved(tmp_path, entry))
 
 
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        (SIZE | {"K": ROWS, "D": [0.2, -0.1, 0.05, -0.02]}, "p1 and p2 are hardly as large"),
-        (SIZE | {"intrinsics": [20.0, 20.0, 31.5, 23.5], "D": FISHEYE}, "the view is as wide as its"),
-    ],
+@each_row(
+    (SIZE | {"K": ROWS, "D": [0.2, -0.1, 0.05, -0.02]}, "p1 and p2 are hardly as large"),
+    (SIZE | {"intrinsics": [20.0, 20.0, 31.5, 23.5], "D": FISHEYE}, "the view is as wide as its"),
 )
 def test_four_numbers_without_a_model_must_be_like_those_of_a_pinhole(tmp_path, entry, words):
     path, text = saved(tmp_path, entry), saved(tmp_path, as_yaml(entry), "camera.yml")

@@ -9,7 +9,7 @@ import torch
 import torchreg as tr
 from tests.io.helpers import put, refused
 from tests.io.test_array_files import header
-from tests.refusing import refusing
+from tests.tables import each, refusing
 from torchreg.io.frames import save_frames
 from torchreg.io.images import list_frames, list_pictures
 from torchreg.io.limits import FileLimits
@@ -105,20 +105,17 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     assert [path.name for path in first] == ["t=5e-2.png", "t=0.05.png"]
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ["frame_0.5.xyz", "frame_1.0.xyz", "frame_1.25.xyz", "frame_1.5.xyz", "frame_10.0.xyz"],
-        ["t=0.05.png", "t=0.1.png", "t=0.25.png", "t=0.3.png"],
-        ["t=-2.ply", "t=-0.5.ply", "t=0.ply", "t=1.ply"],
-        ["2024.01.15.ply", "2024.02.01.ply", "2024.10.01.ply"],
-        ["take1.1.ply", "take1.2.ply", "take1.10.ply", "take1.100.ply", "take2.1.ply"],
-        ["9.ply", "10.ply", "10a.ply", "b.ply"],
-        ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
-        ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
-        ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
-        ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
-    ],
+@each(
+    ["frame_0.5.xyz", "frame_1.0.xyz", "frame_1.25.xyz", "frame_1.5.xyz", "frame_10.0.xyz"],
+    ["t=0.05.png", "t=0.1.png", "t=0.25.png", "t=0.3.png"],
+    ["t=-2.ply", "t=-0.5.ply", "t=0.ply", "t=1.ply"],
+    ["2024.01.15.ply", "2024.02.01.ply", "2024.10.01.ply"],
+    ["take1.1.ply", "take1.2.ply", "take1.10.ply", "take1.100.ply", "take2.1.ply"],
+    ["9.ply", "10.ply", "10a.ply", "b.ply"],
+    ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
+    ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
+    ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
+    ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
 )
 def test_names_sort_as_a_person_would(names):
     assert natural_sorted(reversed(names)) == names

@@ -16,10 +16,11 @@ import trimesh
 import torchreg as tr
 from tests.io.helpers import put, refused
 from tests.io.test_binary_clouds import QUAD, pcd, ply, stl, stl_text
+from tests.tables import each, each_row
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.points import save_points
-from torchreg.io.strict_xml import parse_xml
+from torchreg.io.urdf_file.strict_xml import parse_xml
 
 FormatError, FileWarning, InputError = tr.errors.FormatError, tr.errors.FileWarning, tr.errors.InputError
 SPHERE = unit_sphere(0, dtype=torch.float64)
@@ -124,10 +125,7 @@ def test_damaged_header_digits_never_pass_unnoticed(files, tmp_path, name, word,
     assert outcome(tmp_path / name, files[name].replace(word, word[:-2] + claim)) == 0
 
 
-@pytest.mark.parametrize(
-    "address",
-    ["http://host/a", "file:///etc/passwd", "s3://bucket/a", "HTTPS://host/a", Path("http://host/a"), "\\\\h\\s"],
-)
+@each("http://host/a", "file:///etc/passwd", "s3://bucket/a", "HTTPS://host/a", Path("http://host/a"), "\\\\h\\s")
 def test_addresses_are_refused(address):
     with pytest.raises(FormatError, match="is an address, not a local file: download it first"):
         read_bytes(address)
@@ -189,18 +187,15 @@ def test_elements_of_xml_come_as_they_stand():
     parse_xml(b"<a>" * 64 + b"</a>" * 64)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "not well-formed XML"),
-        (b"<a>", "not well-formed XML"),
-        (b"<a></b>", "not well-formed XML"),
-        (b"<?xml version='1.0' encoding='klingon'?><a/>", "not well-formed XML"),
-        (b"<a>\xff</a>", "not well-formed XML"),
-        (b"<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", r"document type declaration \('a'\)"),
-        (b"<!DOCTYPE a SYSTEM 'file:///etc/passwd'><a/>", "document type declaration"),
-        (b"<a>" * 65 + b"</a>" * 65, "nests elements more than 64 deep"),
-    ],
+@each_row(
+    (b"", "not well-formed XML"),
+    (b"<a>", "not well-formed XML"),
+    (b"<a></b>", "not well-formed XML"),
+    (b"<?xml version='1.0' encoding='klingon'?><a/>", "not well-formed XML"),
+    (b"<a>\xff</a>", "not well-formed XML"),
+    (b"<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", r"document type declaration \('a'\)"),
+    (b"<!DOCTYPE a SYSTEM 'file:///etc/passwd'><a/>", "document type declaration"),
+    (b"<a>" * 65 + b"</a>" * 65, "nests elements more than 64 deep"),
 )
 def test_xml_that_is_refused(content, message):
     with pytest.raises(FormatError, match=message):

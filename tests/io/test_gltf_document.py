@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import torchreg as tr
 from tests.gltf_player import KINDS, TYPES
 from tests.io.helpers import refused
-from tests.refusing import refusing
+from tests.tables import refusing
 from torchreg.io.gltf_file.document import GltfDocument, parents_first
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 

@@ -11,7 +11,7 @@ import trimesh
 
 import torchreg as tr
 from tests.io.helpers import TURN, UPPER, VERTICES, Scene, bar, put, read, refused, shift
-from tests.refusing import refusing
+from tests.tables import each, each_row, refusing
 from torchreg.io.limits import FileLimits
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
@@ -49,14 +49,11 @@ def corners(path, **options):
     return np.stack([points.amin(0), points.amax(0)]).round(4)
 
 
-@pytest.mark.parametrize(
-    "node",
-    [
-        {},
-        {"translation": [1, 2, 3], "rotation": [0.5, 0.5, 0.5, 0.5], "scale": [2, 1, -1]},
-        {"matrix": [0, 2, 0, 0, -1, 0, 0, 0, 0, 0, 3, 0, 5, 6, 7, 1]},
-        {"rotation": [0, 0, math.sin(0.3), math.cos(0.3)]},
-    ],
+@each(
+    {},
+    {"translation": [1, 2, 3], "rotation": [0.5, 0.5, 0.5, 0.5], "scale": [2, 1, -1]},
+    {"matrix": [0, 2, 0, 0, -1, 0, 0, 0, 0, 0, 3, 0, 5, 6, 7, 1]},
+    {"rotation": [0, 0, math.sin(0.3), math.cos(0.3)]},
 )
 def test_node_transforms_agree_with_trimesh(tmp_path, square, node):
     square.json["nodes"] = [{"children": [1], "scale": [1, 3, 1]}, {"mesh": 0, **node}]
@@ -96,9 +93,7 @@ def test_several_primitives_share_vertices_and_nodes_repeat_them(tmp_path, squar
     np.testing.assert_array_equal(load(tmp_path, square).points, wanted)
 
 
-@pytest.mark.parametrize(
-    ("mode", "faces"), [(5, [[0, 1, 2], [2, 1, 3]]), (6, [[0, 1, 2], [0, 2, 3]]), (0, None), (3, None)]
-)
+@each_row((5, [[0, 1, 2], [2, 1, 3]]), (6, [[0, 1, 2], [0, 2, 3]]), (0, None), (3, None))
 def test_other_modes(tmp_path, square, mode, faces):
     primitive = square.json["meshes"][0]["primitives"][0]
     primitive["mode"] = mode

@@ -11,7 +11,7 @@ from PIL import Image
 
 import torchreg as tr
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import each, each_row, refusing
 from torchreg.io.calibration import load_depth_camera
 from torchreg.io.images import list_frames, list_pictures, load_depth, load_image, load_mask, save_depth, save_image
 from torchreg.io.limits import FileLimits
@@ -29,12 +29,9 @@ def picture(path, values):
     return path
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "scale"),
-    [
-        ("d.png", "u2", 1e-3), ("d.tif", "u2", 1e-3), ("d.tiff", "f4", 1e-3), ("d.png", "u2", 2e-4),
-        *(("d.npy", kind, 5e-4) for kind in ("u2", "f2", "f4", "f8")),
-    ],
+@each_row(
+    ("d.png", "u2", 1e-3), ("d.tif", "u2", 1e-3), ("d.tiff", "f4", 1e-3), ("d.png", "u2", 2e-4),
+    *(("d.npy", kind, 5e-4) for kind in ("u2", "f2", "f4", "f8")),
 )  # fmt: skip
 def test_depth_of_every_kind(tmp_path, name, kind, scale):
     depth = load_depth(picture(tmp_path / name, STEPS.astype(kind)), scale)
@@ -136,13 +133,10 @@ def test_sizes_are_those_of_the_camera_and_no_more_than_64_megapixels(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("load", "name"),
-    [
-        *((load_depth, name) for name in ("d.png", "d.tif", "d.npy")),
-        *((load, name) for load in (load_image, load_mask) for name in ("b.png", "b.jpg", "b.tif", "b.bmp")),
-        (load_mask, "m.npy"),
-    ],
+@each_row(
+    *((load_depth, name) for name in ("d.png", "d.tif", "d.npy")),
+    *((load, name) for load in (load_image, load_mask) for name in ("b.png", "b.jpg", "b.tif", "b.bmp")),
+    (load_mask, "m.npy"),
 )
 def test_files_that_are_cut_off_are_refused(tmp_path, load, name):
     rng = np.random.default_rng(0)
@@ -198,17 +192,14 @@ def depths(tmp_path, values, **camera):
 MILLIMETERS, FIFTHS = np.round(1000 * DOME).astype("u2"), np.round(5000 * DOME).astype("u2")
 
 
-@pytest.mark.parametrize(
-    ("values", "camera", "words"),
-    [
-        *((DOME.astype(kind), {}, None) for kind in ("f2", "f4", "f8")),
-        (1000 * DOME, {}, r"d\.npy: numbers around 12.. are taken for millimeters"),
-        (FIFTHS, {"depth_scale": 1 / 5000}, None),
-        (MILLIMETERS, {"depth_scale": 1}, r"depths around 1\.2e\+03 m are unlikely: with depth_scale 1"),
-        (DOME, {"depth_scale": 0.001}, r"depths around 0\.0012 m are unlikely"),
-        (MILLIMETERS, {"depth_units": 1000}, r"k\.json: depth_units 1000 is taken for units per metre"),
-        (MILLIMETERS, {"depth_factor": 0.001}, r"k\.json: depth_factor 0.001 is taken for metres per unit"),
-    ],
+@each_row(
+    *((DOME.astype(kind), {}, None) for kind in ("f2", "f4", "f8")),
+    (1000 * DOME, {}, r"d\.npy: numbers around 12.. are taken for millimeters"),
+    (FIFTHS, {"depth_scale": 1 / 5000}, None),
+    (MILLIMETERS, {"depth_scale": 1}, r"depths around 1\.2e\+03 m are unlikely: with depth_scale 1"),
+    (DOME, {"depth_scale": 0.001}, r"depths around 0\.0012 m are unlikely"),
+    (MILLIMETERS, {"depth_units": 1000}, r"k\.json: depth_units 1000 is taken for units per metre"),
+    (MILLIMETERS, {"depth_factor": 0.001}, r"k\.json: depth_factor 0.001 is taken for metres per unit"),
 )
 def test_units_of_depth(tmp_path, values, camera, words):
     if words is None:
@@ -230,9 +221,7 @@ test_wrong_units = refusing(lambda folder, values, camera: depths(folder, values
 )
 
 
-@pytest.mark.parametrize(
-    ("kind", "mark", "unit"), [("u2", 65535, 1000), ("f4", 1e10, 1), ("f2", 65504, 1), ("f4", -1, 1)]
-)
+@each_row(("u2", 65535, 1000), ("f4", 1e10, 1), ("f2", 65504, 1), ("f4", -1, 1))
 def test_marks_of_no_depth_are_none(tmp_path, kind, mark, unit):
     values = (unit * DOME).astype(kind)
     values[:, :12] = mark
@@ -240,12 +229,9 @@ def test_marks_of_no_depth_are_none(tmp_path, kind, mark, unit):
     assert 0.9 < low < high < 1.3
 
 
-@pytest.mark.parametrize(
-    ("camera", "words"),
-    [
-        ({"fx": 600.0, "fy": 600.0, "cx": 319.5, "cy": 239.5}, r"319\.5, 239\.5 lies outside .* 64 x 48.*640 x 480"),
-        ({"width": 640, "height": 480}, "is far from the middle of a picture of 640 x 480"),
-    ],
+@each_row(
+    ({"fx": 600.0, "fy": 600.0, "cx": 319.5, "cy": 239.5}, r"319\.5, 239\.5 lies outside .* 64 x 48.*640 x 480"),
+    ({"width": 640, "height": 480}, "is far from the middle of a picture of 640 x 480"),
 )
 def test_the_principal_point_of_another_picture_warns(tmp_path, camera, words):
     with pytest.warns(FileWarning, match=words):
@@ -310,16 +296,13 @@ BLACK_ON_WHITE = np.concatenate(
 )
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        *(np.where(DISK, high, low).astype(kind) for kind in ("u1", "u2")
-          for low, high in ((0, 1), (0, 100), (0, 255), (50, 200), (1, 2), (254, 255))),
-        *(kind for color in ((64, 0, 0), (0, 0, 255), (255, 255, 255), (1, 1, 1))
-          for kind in (DISK[..., None] * np.array(color, "u1"), in_palette(8 * DISK, {8: color}))),
-        gray_alpha(255, 255 * DISK), gray_alpha(90, 255 * DISK)[..., 2:], BLACK_ON_WHITE,
-        (65535 * DISK.astype("u4")).astype("u2"), Image.fromarray(DISK),
-    ],
+@each(
+    *(np.where(DISK, high, low).astype(kind) for kind in ("u1", "u2")
+      for low, high in ((0, 1), (0, 100), (0, 255), (50, 200), (1, 2), (254, 255))),
+    *(kind for color in ((64, 0, 0), (0, 0, 255), (255, 255, 255), (1, 1, 1))
+      for kind in (DISK[..., None] * np.array(color, "u1"), in_palette(8 * DISK, {8: color}))),
+    gray_alpha(255, 255 * DISK), gray_alpha(90, 255 * DISK)[..., 2:], BLACK_ON_WHITE,
+    (65535 * DISK.astype("u4")).astype("u2"), Image.fromarray(DISK),
 )  # fmt: skip
 def test_the_brighter_the_colored_or_the_opaque_is_set(tmp_path, values):
     assert (masked(tmp_path, values) == DISK).all()
@@ -349,15 +332,12 @@ def test_halos_of_one_value_are_beside_the_mask(tmp_path, value, kind):
 INNER, ANGLE = np.hypot(ROW - 24, COLUMN - 32) < 7, np.arctan2(ROW - 24, COLUMN - 32)
 
 
-@pytest.mark.parametrize(
-    "labels",
-    [
-        DISK + 2 * (ROW < 8),
-        np.select([INNER, DISK], [2, 1], 0),
-        np.select([INNER, DISK], [255, 127], 0),
-        np.select([DISK & (COLUMN < 32), DISK], [255, 128], 0),
-        np.where(DISK, 20 * (1 + (ANGLE + np.pi) // 0.6), 0),
-    ],
+@each(
+    DISK + 2 * (ROW < 8),
+    np.select([INNER, DISK], [2, 1], 0),
+    np.select([INNER, DISK], [255, 127], 0),
+    np.select([DISK & (COLUMN < 32), DISK], [255, 128], 0),
+    np.where(DISK, 20 * (1 + (ANGLE + np.pi) // 0.6), 0),
 )
 def test_labels_that_nest_or_touch_are_no_halos(tmp_path, labels):
     with pytest.warns(FileWarning, match=rf"holds \d+ {LABELS}"):
@@ -376,9 +356,7 @@ def test_arrays_of_two_values_of_probabilities_and_of_scores(tmp_path):
     assert (load_mask(picture(tmp_path / "s.npy", scores)).numpy() == DISK).all()
 
 
-@pytest.mark.parametrize(
-    ("value", "words"), [(0, "keeps none of its 3072 pixels"), (255, "keeps all"), (7, "keeps all")]
-)
+@each_row((0, "keeps none of its 3072 pixels"), (255, "keeps all"), (7, "keeps all"))
 def test_a_mask_of_one_value_warns(tmp_path, value, words):
     with pytest.warns(FileWarning, match=rf"m\.png: the mask {words}"):
         assert (masked(tmp_path, np.full((48, 64), value, "u1")) == bool(value)).all()

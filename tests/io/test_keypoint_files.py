@@ -3,7 +3,7 @@
 import torch
 
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import refusing
 from torchreg.io.keypoints import load_keypoints
 
 

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 import torchreg as tr
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import each_row, refusing
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.frames import save_frames
 from torchreg.io.limits import FileLimits
@@ -31,17 +31,11 @@ def exported(kind, **options):
     return mesh.export(file_type=kind, **options)
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("binary.ply", exported("ply")),
-        ("text.PLY", exported("ply", encoding="ascii")),
-        ("surface.obj", exported("obj")),
-        ("surface.glb", exported("glb")),
-        ("surface.stl", exported("stl")),
-        ("text.stl", exported("stl_ascii")),
-    ],
-)
+@each_row(
+    ("binary.ply", exported("ply")), ("text.PLY", exported("ply", encoding="ascii")),
+    ("surface.obj", exported("obj")), ("surface.glb", exported("glb")), ("surface.stl", exported("stl")),
+    ("text.stl", exported("stl_ascii")),
+)  # fmt: skip
 def test_meshes_and_scans_written_by_trimesh(tmp_path, name, content):
     mesh = tr.load_mesh(put(tmp_path, name, content))
     assert (mesh.vertices.dtype, mesh.faces.dtype) == (torch.float32, torch.int64)
@@ -138,15 +132,12 @@ def test_omit_drops_faces_and_renumbers(tmp_path):
     assert float(tr.load_points(large, dtype=torch.float64).points[0, 0]) == 1e300
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.ply", PLY.format("ascii", 10**12, "float", "1 2 3\n")),
-        ("a.ply", PLY.format("binary_little_endian", 10**7, "float", "1 2 3\n")),
-        ("a.pcd", PCD.format(10**7, "binary")),
-        ("a.pcd", PCD.format(10**7, "binary_compressed") + "\0" * 50),
-        ("a.stl", b"\0" * 80 + b"\xff\xff\xff\xff" + b"\0" * 100),
-    ],
+@each_row(
+    ("a.ply", PLY.format("ascii", 10**12, "float", "1 2 3\n")),
+    ("a.ply", PLY.format("binary_little_endian", 10**7, "float", "1 2 3\n")),
+    ("a.pcd", PCD.format(10**7, "binary")),
+    ("a.pcd", PCD.format(10**7, "binary_compressed") + "\0" * 50),
+    ("a.stl", b"\0" * 80 + b"\xff\xff\xff\xff" + b"\0" * 100),
 )
 def test_claims_are_refused_before_allocation(tmp_path, name, content):
     path = put(tmp_path, name, content)
@@ -244,23 +235,20 @@ def test_arrays_are_recognized_whatever_the_file_is_called(tmp_path, ending, sav
         np.testing.assert_allclose(torch.stack(list(tr.load_frames(path))), stack)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.scan", b"version https://git-lfs.github.com/spec/v1\noid a\nsize 9\n", "Git LFS pointer.*git lfs pull"),
-        ("a.scan", b"<!DOCTYPE html><html><body>Not found</body></html>", "is a web page"),
-        ("a.scan", b"\0\1\2\3", "has the unknown ending '.scan'.*known: .ply, .pcd"),
-        *((name, content, rf"{name}: is of a format that is not read \(.*{words}") for name, content, words in (
-            ("a.e57", b"ASTM-E57" + bytes(40), "E57.*CloudCompare.*PLY.*pye57"),
-            ("a.E57", b"", "E57.*CloudCompare"),
-            ("a.xyz", b"ASTM-E57" + bytes(40), "E57.*CloudCompare"),
-            ("a.laz", b"LASF" + bytes(40), "LAS or LAZ.*CloudCompare.*laspy"),
-            ("a.rcs", bytes(9), "scanner's own format.*PTX or PLY"),
-            ("a.bag", b"#ROSBAG V2.0", "ROS recording.*PCD"),
-            ("a.fbx", b"Kaydara FBX Binary", r"glTF \(\.glb\)"),
-            ("a.step", b"ISO-10303-21;", "CAD model.*STL"),
-        )),
-    ],
+@each_row(
+    ("a.scan", b"version https://git-lfs.github.com/spec/v1\noid a\nsize 9\n", "Git LFS pointer.*git lfs pull"),
+    ("a.scan", b"<!DOCTYPE html><html><body>Not found</body></html>", "is a web page"),
+    ("a.scan", b"\0\1\2\3", "has the unknown ending '.scan'.*known: .ply, .pcd"),
+    *((name, content, rf"{name}: is of a format that is not read \(.*{words}") for name, content, words in (
+        ("a.e57", b"ASTM-E57" + bytes(40), "E57.*CloudCompare.*PLY.*pye57"),
+        ("a.E57", b"", "E57.*CloudCompare"),
+        ("a.xyz", b"ASTM-E57" + bytes(40), "E57.*CloudCompare"),
+        ("a.laz", b"LASF" + bytes(40), "LAS or LAZ.*CloudCompare.*laspy"),
+        ("a.rcs", bytes(9), "scanner's own format.*PTX or PLY"),
+        ("a.bag", b"#ROSBAG V2.0", "ROS recording.*PCD"),
+        ("a.fbx", b"Kaydara FBX Binary", r"glTF \(\.glb\)"),
+        ("a.step", b"ISO-10303-21;", "CAD model.*STL"),
+    )),
 )  # fmt: skip
 def test_other_formats_are_named_with_a_way_to_convert_them(tmp_path, name, content, words):
     path = put(tmp_path, name, content)

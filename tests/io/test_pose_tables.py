@@ -2,10 +2,8 @@
 
 import math
 
-import pytest
-
 from tests.io.helpers import put
-from tests.refusing import refusing
+from tests.tables import each, refusing
 from torchreg.io.pose_table import load_pose_table, save_pose_table
 
 NAMES = ("pan", "lift", "elbow")
@@ -22,20 +20,17 @@ def table(separator, decimals=".", newline="\n", extra=()):
     return newline.join(separator.join(line) for line in lines) + newline
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        table(","),
-        table(";"),
-        table(";", ","),
-        table("\t", ",", "\r\n"),
-        b"\xef\xbb\xbf" + table(";", ",", "\r\n").encode(),
-        table("\t", ",").encode("utf-16"),
-        table(";", ",", extra=[("time", "12:00:03.5"), ("note", "a, b")]),
-        table(";", ",").replace("\n", ";\n"),
-        table(";", ",").replace("lift;", "lift ;").replace("0,5", '"0,5"'),
-        'pan,lift,elbow\n"0,5","-1,25",3\n"0,001","0,7",-2\n',
-    ],
+@each(
+    table(","),
+    table(";"),
+    table(";", ","),
+    table("\t", ",", "\r\n"),
+    b"\xef\xbb\xbf" + table(";", ",", "\r\n").encode(),
+    table("\t", ",").encode("utf-16"),
+    table(";", ",", extra=[("time", "12:00:03.5"), ("note", "a, b")]),
+    table(";", ",").replace("\n", ";\n"),
+    table(";", ",").replace("lift;", "lift ;").replace("0,5", '"0,5"'),
+    'pan,lift,elbow\n"0,5","-1,25",3\n"0,001","0,7",-2\n',
 )
 def test_numbers_have_points_or_commas(tmp_path, content):
     assert [list(row.values()) for row in read(tmp_path, content)] == ROWS

@@ -10,7 +10,7 @@ import torch
 
 import torchreg as tr
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import each, refusing
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.io.limits import FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
@@ -22,14 +22,10 @@ METADATA = {"kind": "align", "steps": [1, 2.5, None, True], "nested": {"é": "ü
 def example() -> dict[str, torch.Tensor]:
     base = torch.arange(12, dtype=torch.float64).reshape(3, 4)
     return {
-        "zeta": base.T,
-        "alpha": base[:, :2],
-        "scalar": torch.tensor(2.5, requires_grad=True),
-        "empty": torch.zeros(0, 3),
-        "flags": torch.tensor([True, False]),
-        "faces": torch.tensor([[0, 1, 2]]),
+        "zeta": base.T, "alpha": base[:, :2], "scalar": torch.tensor(2.5, requires_grad=True),
+        "empty": torch.zeros(0, 3), "flags": torch.tensor([True, False]), "faces": torch.tensor([[0, 1, 2]]),
         "half": torch.tensor([math.nan, 1.0], dtype=torch.bfloat16),
-    }
+    }  # fmt: skip
 
 
 def stored(folder):
@@ -144,9 +140,7 @@ test_what_cannot_be_saved = refusing(lambda folder, *given: save_tensors(folder 
 )
 
 
-@pytest.mark.parametrize(
-    "content", [b"[" + b"9" * 4400 + b"]", b"[1e999]", b"[" * 5000, b'{"x": 1' + b"0" * 400 + b"}"]
-)
+@each(b"[" + b"9" * 4400 + b"]", b"[1e999]", b"[" * 5000, b'{"x": 1' + b"0" * 400 + b"}")
 def test_poses_in_json_that_are_refused(tmp_path, content):
     with pytest.raises(tr.errors.TorchregError):
         load_pose(put(tmp_path, "pose.json", content), tr.Hand())

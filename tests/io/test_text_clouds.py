@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import torchreg as tr
 from tests.io.helpers import read, refused
-from tests.refusing import refusing
+from tests.tables import each, each_row, refusing
 from torchreg.io.limits import FileLimits
 from torchreg.io.points import save_points
 
@@ -35,26 +35,23 @@ def test_numbers_are_read_as_python_reads_them(tmp_path, numbers):
     np.testing.assert_array_equal(read(tmp_path, "a.xyz", content).points, np.array(numbers))
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "1 -2 3e1\n0.5 0 +6",
-        "\n1,-2,30\r\n\r\n0.5,0,6\r\n",
-        "# x y z\n  # indented\n1 -2 30 # behind numbers\n\n0.5 0 6#close\n# last",
-        "// one\n1,-2,30 // two # three\n0.5;0;6\n",
-        "2\nX;Y;Z\n1;-2;30\n0.5;0;6\n",
-        " 'x' 'y' 'z'\n1\t-2\t30\n0.5\t0\t6",
-        "2 # points\n1 -2 30\n0.5 0 6\n",
-        "label,x,y,z,when\nwall,1,-2,30,12:30\nfloor,0.5,0,6,12:31\n",
-        "\ufeff1 -2 30\r0.5 0 6\r",
-        "1 -2 30\n0.5 0 6\n".encode("utf-16"),
-        ",0,1,2\n0,1,-2,30\n1,0.5,0,6\n",
-        "0,1,2\n1.0,-2.0,30.0\n0.5,0.0,6.0\n",
-        "x,y,z,intensity\n1,-2,30,0.3\n0.5,0,6,0.7\n",
-        "1 -2 30 0.3 0\n0.5 0 6 0.7 1\n",
-        "1,0;-2,0;30,0\n0,5;0,0;6,0\n",
-        "1,0 -2,0 30,0\n0,5 0,0 6,0\n",
-    ],
+@each(
+    "1 -2 3e1\n0.5 0 +6",
+    "\n1,-2,30\r\n\r\n0.5,0,6\r\n",
+    "# x y z\n  # indented\n1 -2 30 # behind numbers\n\n0.5 0 6#close\n# last",
+    "// one\n1,-2,30 // two # three\n0.5;0;6\n",
+    "2\nX;Y;Z\n1;-2;30\n0.5;0;6\n",
+    " 'x' 'y' 'z'\n1\t-2\t30\n0.5\t0\t6",
+    "2 # points\n1 -2 30\n0.5 0 6\n",
+    "label,x,y,z,when\nwall,1,-2,30,12:30\nfloor,0.5,0,6,12:31\n",
+    "\ufeff1 -2 30\r0.5 0 6\r",
+    "1 -2 30\n0.5 0 6\n".encode("utf-16"),
+    ",0,1,2\n0,1,-2,30\n1,0.5,0,6\n",
+    "0,1,2\n1.0,-2.0,30.0\n0.5,0.0,6.0\n",
+    "x,y,z,intensity\n1,-2,30,0.3\n0.5,0,6,0.7\n",
+    "1 -2 30 0.3 0\n0.5 0 6 0.7 1\n",
+    "1,0;-2,0;30,0\n0,5;0,0;6,0\n",
+    "1,0 -2,0 30,0\n0,5 0,0 6,0\n",
 )
 def test_points_are_read_whatever_stands_between_and_beside_them(tmp_path, content):
     cloud = read(tmp_path, "a.txt", content)
@@ -62,21 +59,18 @@ def test_points_are_read_whatever_stands_between_and_beside_them(tmp_path, conte
     assert (cloud.normals, cloud.colors) == (None, None)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "kept"),
-    [
-        ("cloud.csv", "X,Y,Z,R,G,B\n" + rows(POINTS, COLORS, sep=","), "colors"),
-        ("cloud.csv", "//X,Y,Z,R,G,B,Intensity\n" + rows(POINTS, COLORS, np.arange(50), sep=","), "colors"),
-        ("cloud.csv", "time;x [m];y [m];z [m];r;g;b\n" + rows(np.arange(50), POINTS, COLORS, sep=";"), "colors"),
-        ("cloud.pts", "50\n" + rows(POINTS, -np.arange(50), COLORS), "colors"),
-        ("cloud.pts", "50\n" + rows(POINTS, np.arange(50), COLORS), "colors"),
-        ("cloud.xyz", rows(POINTS, COLORS), "colors"),
-        ("cloud.xyz", rows(POINTS, COLORS, NORMALS), "colors, normals"),
-        ("cloud.txt", rows(POINTS, NORMALS, COLORS, sep="\t"), "colors, normals"),
-        ("cloud.asc", rows(POINTS, COLORS, 300 + np.arange(50)), "colors"),
-        ("cloud.xyz", "x y z nx ny nz\n" + rows(POINTS, NORMALS), "normals"),
-        ("cloud.xyz", "X,Y,Z,Normal_X,Normal_Y,Normal_Z\n" + rows(POINTS, NORMALS, sep=","), "normals"),
-    ],
+@each_row(
+    ("cloud.csv", "X,Y,Z,R,G,B\n" + rows(POINTS, COLORS, sep=","), "colors"),
+    ("cloud.csv", "//X,Y,Z,R,G,B,Intensity\n" + rows(POINTS, COLORS, np.arange(50), sep=","), "colors"),
+    ("cloud.csv", "time;x [m];y [m];z [m];r;g;b\n" + rows(np.arange(50), POINTS, COLORS, sep=";"), "colors"),
+    ("cloud.pts", "50\n" + rows(POINTS, -np.arange(50), COLORS), "colors"),
+    ("cloud.pts", "50\n" + rows(POINTS, np.arange(50), COLORS), "colors"),
+    ("cloud.xyz", rows(POINTS, COLORS), "colors"),
+    ("cloud.xyz", rows(POINTS, COLORS, NORMALS), "colors, normals"),
+    ("cloud.txt", rows(POINTS, NORMALS, COLORS, sep="\t"), "colors, normals"),
+    ("cloud.asc", rows(POINTS, COLORS, 300 + np.arange(50)), "colors"),
+    ("cloud.xyz", "x y z nx ny nz\n" + rows(POINTS, NORMALS), "normals"),
+    ("cloud.xyz", "X,Y,Z,Normal_X,Normal_Y,Normal_Z\n" + rows(POINTS, NORMALS, sep=","), "normals"),
 )
 def test_columns_of_colors_and_normals_are_recognized(tmp_path, name, content, kept):
     cloud = read(tmp_path, name, content)
@@ -150,21 +144,18 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 NAMED = "mtllib none.mtl\no square\ng top\ns off\n" + SQUARE + "vt 0 0\nvt 1 1\nvn 0 0 1\nusemtl red\nf {}\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "faces"),
-    [
-        (SQUARE + "v 0.5 2 0\nf 1 2 3 4\nf 1 2 3 5 4\nf 1 2 3\n",
-         [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 4], [0, 4, 3], [0, 1, 2]]),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 0 0\nv 6 0 0\nv 5 1 0\nf -3 -2 -1\nf -6 2 -4\n",
-         [[0, 1, 2], [3, 4, 5], [0, 1, 2]]),
-        ("v 0 0 0\nf 3 2 1\nv 1 0 0\nv 0 1 0\n", [[2, 1, 0]]),  # named ahead of their lines
-        ("v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3/1/1 -2/2/1 -1/3/1\nv 0 1 0\nvt 0 0\nvt 1 1\nvt 1 0\nvn 0 0 1\n"
-         "f 1/2 3/1 4/1 # quad next\nf 1 2 3 4\n", [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 3]]),
-        *((NAMED.format(corners), [[0, 1, 2], [0, 2, 3]]) for corners in (
-            "1 2 3 4", "1/1 2/2 3/1 4/2", "1/1/1 2/2/1 3/1/1 4/2/1", "1//1 2//1 3//1 4//1"
-        )),
-        *((text, None) for text in ("v\t1 \\\n 2 3", "v 1 2 3 1\n", "v 1 2 3 # 0 0 1\n", "v 1.0 2e0 3 1\r\no x\r\n")),
-    ],
+@each_row(
+    (SQUARE + "v 0.5 2 0\nf 1 2 3 4\nf 1 2 3 5 4\nf 1 2 3\n",
+     [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 4], [0, 4, 3], [0, 1, 2]]),
+    ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 0 0\nv 6 0 0\nv 5 1 0\nf -3 -2 -1\nf -6 2 -4\n",
+     [[0, 1, 2], [3, 4, 5], [0, 1, 2]]),
+    ("v 0 0 0\nf 3 2 1\nv 1 0 0\nv 0 1 0\n", [[2, 1, 0]]),  # named ahead of their lines
+    ("v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3/1/1 -2/2/1 -1/3/1\nv 0 1 0\nvt 0 0\nvt 1 1\nvt 1 0\nvn 0 0 1\n"
+     "f 1/2 3/1 4/1 # quad next\nf 1 2 3 4\n", [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 3]]),
+    *((NAMED.format(corners), [[0, 1, 2], [0, 2, 3]]) for corners in (
+        "1 2 3 4", "1/1 2/2 3/1 4/2", "1/1/1 2/2/1 3/1/1 4/2/1", "1//1 2//1 3//1 4//1"
+    )),
+    *((text, None) for text in ("v\t1 \\\n 2 3", "v 1 2 3 1\n", "v 1 2 3 # 0 0 1\n", "v 1.0 2e0 3 1\r\no x\r\n")),
 )  # fmt: skip
 def test_vertices_and_faces_of_obj(tmp_path, text, faces):
     cloud = read(tmp_path, "a.obj", text)
@@ -175,17 +166,10 @@ def test_vertices_and_faces_of_obj(tmp_path, text, faces):
     assert cloud.normals is None  # or several vertices share one
 
 
-@pytest.mark.parametrize(
-    ("faces", "kept"),
-    [
-        ("f 1//1 2//2 3//3\n", True),
-        ("f -3//-3 -2//2 3//-1\n", True),
-        ("f 1/9/1 2/9/2 3/9/3\n", True),
-        ("", True),
-        ("f 1//1 2//2 3//1\n", False),
-        ("f 1//3 2//2 3//1\n", False),
-    ],
-)
+@each_row(
+    ("f 1//1 2//2 3//3\n", True), ("f -3//-3 -2//2 3//-1\n", True), ("f 1/9/1 2/9/2 3/9/3\n", True), ("", True),
+    ("f 1//1 2//2 3//1\n", False), ("f 1//3 2//2 3//1\n", False),
+)  # fmt: skip
 def test_normals_of_obj_are_read_where_each_vertex_has_its_own(tmp_path, faces, kept):
     normals = read(tmp_path, "a.obj", "v 0 0 0\nvn 1 0 0\nv 1 0 0\nvn 0 1 0 # up\nv 0 1 0\nvn 0 0 1\n" + faces).normals
     assert (normals is not None) == kept

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 import torchreg as tr
 from tests.io.helpers import put, refused
-from tests.refusing import refusing
+from tests.tables import refusing
 from torchreg.io.limits import FILE_BUDGET, FileLimits
-from torchreg.io.mesh_files import MeshFiles
 from torchreg.io.urdf import load_urdf
+from torchreg.io.urdf_file.mesh_files import MeshFiles
 
 FileWarning, FormatError, ModelError = tr.errors.FileWarning, tr.errors.FormatError, tr.errors.ModelError
 BOX = "<box size='0.1 0.08 0.4'/>"

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import torchreg as tr
 from tests.gltf_player import Player
 from tests.io.helpers import refused
-from tests.refusing import refusing
+from tests.tables import refusing
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.upright import to_y_up
 from torchreg.io.gltf_file.morph import save_vertex_animation

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 import torchreg as tr
+from tests.tables import each_row
 from torchreg.viz import animation, figures, spines, tracking
 from torchreg.viz import scene as sc
 from torchreg.viz.result_scenes import result_scene
@@ -261,17 +262,14 @@ def test_an_interruption_leaves_the_frames_so_far_and_a_failing_frame_no_file(to
     assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
 
 
-@pytest.mark.parametrize(
-    ("frames", "name", "fps", "message"),
-    [
-        ([], "a.gif", 20, "frames must hold at least one frame"),
-        ([plain(0)], "a.avi", 20, r"path must end in \.gif or \.mp4, got 'a\.avi'"),
-        ([plain(0)], "none/a.gif", 20, "does not exist"),
-        ([plain(0)], "a.gif", 0.0, "fps must be positive"),
-        ([np.zeros((4, 4))], "a.gif", 20, r"frames\[0\] must have shape \(H, W, 3\)"),
-        ([np.full((4, 4, 3), 7.0)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
-        ([np.full((4, 4, 3), np.nan)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
-    ],
+@each_row(
+    ([], "a.gif", 20, "frames must hold at least one frame"),
+    ([plain(0)], "a.avi", 20, r"path must end in \.gif or \.mp4, got 'a\.avi'"),
+    ([plain(0)], "none/a.gif", 20, "does not exist"),
+    ([plain(0)], "a.gif", 0.0, "fps must be positive"),
+    ([np.zeros((4, 4))], "a.gif", 20, r"frames\[0\] must have shape \(H, W, 3\)"),
+    ([np.full((4, 4, 3), 7.0)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
+    ([np.full((4, 4, 3), np.nan)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
 )
 def test_save_animation_refuses(tmp_path, frames, name, fps, message):
     with pytest.raises((InputError, FileNotFoundError), match=message):
@@ -379,13 +377,10 @@ def test_surfaces_without_data_are_gray_and_data_are_blue_or_gray(drawing, track
     assert np.abs(drawing(captions=["12  lost"])[corner] - usual[corner]).max() > 100
 
 
-@pytest.mark.parametrize(
-    ("arguments", "label"),
-    [
-        ((3, tr.Status.CONVERGED, "tracked"), "frame 3: tracked"),
-        ((0, tr.Status.MAX_STEPS, "found"), "frame 0: found"),
-        ((12, tr.Status.NO_DATA, "held"), "frame 12: no_data"),
-    ],
+@each_row(
+    ((3, tr.Status.CONVERGED, "tracked"), "frame 3: tracked"),
+    ((0, tr.Status.MAX_STEPS, "found"), "frame 0: found"),
+    ((12, tr.Status.NO_DATA, "held"), "frame 12: no_data"),
 )
 def test_labels_name_the_source_of_a_pose_or_the_reason_for_none(arguments, label):
     assert tracking.frame_label(*arguments) == label
@@ -456,17 +451,14 @@ def test_a_track_plays_with_the_inliers_of_the_tracker(tools, plain_hand, coarse
         tracking.save_track_gltf(tmp_path / "a.glb", plain_hand, lost, skin=coarse)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"frames": slice(3)}, r"result\.poses must have shape \(3, 27\), got \(4, 27\)"),
-        ({"inliers": [torch.ones(3) > 0]}, r"inliers must hold one entry per pose \(4\), got 1"),
-        ({"inliers": [torch.ones(3) > 0] * 4}, "inliers must have shape"),
-        ({"inliers": [torch.ones(300)] * 4}, "inliers must"),
-        ({"frames": slice(0), "poses": slice(0)}, "frames must hold at least one cloud"),
-        ({"inlier_distance": 0.0}, "inlier_distance must be positive"),
-        ({"path": "a.png"}, "path must end in"),
-    ],
+@each_row(
+    ({"frames": slice(3)}, r"result\.poses must have shape \(3, 27\), got \(4, 27\)"),
+    ({"inliers": [torch.ones(3) > 0]}, r"inliers must hold one entry per pose \(4\), got 1"),
+    ({"inliers": [torch.ones(3) > 0] * 4}, "inliers must have shape"),
+    ({"inliers": [torch.ones(300)] * 4}, "inliers must"),
+    ({"frames": slice(0), "poses": slice(0)}, "frames must hold at least one cloud"),
+    ({"inlier_distance": 0.0}, "inlier_distance must be positive"),
+    ({"path": "a.png"}, "path must end in"),
 )
 def test_animate_track_refuses(plain_hand, coarse, tracked, tmp_path, options, message):
     frames, _, result = tracked

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.tables import each_row
 from torchreg.viz import bone_colors
 from torchreg.viz import scene as sc
 from torchreg.viz.result_scenes import result_scene
@@ -103,16 +104,13 @@ def test_sequences_of_scans_and_spines_show_every_frame(sequence, spine, ball):
     assert names(result_scene(spine)) == ["limbs"]
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "words"),
-    [
-        ("alignment", {"data": [POINTS, POINTS]}, "one cloud per frame"),
-        ("alignment", {"data": [POINTS]}, r"result\.inliers"),
-        ("starts", {}, "shape must be given"),
-        ("spine", {"data": [POINTS]}, "one surface per frame"),
-        ("spine", {"shape": True}, "shape has no meaning for a SpineSequence"),
-        ("registration", {"shape": True}, "shape has no meaning for a ScanRegistration"),
-    ],
+@each_row(
+    ("alignment", {"data": [POINTS, POINTS]}, "one cloud per frame"),
+    ("alignment", {"data": [POINTS]}, r"result\.inliers"),
+    ("starts", {}, "shape must be given"),
+    ("spine", {"data": [POINTS]}, "one surface per frame"),
+    ("spine", {"shape": True}, "shape has no meaning for a SpineSequence"),
+    ("registration", {"shape": True}, "shape has no meaning for a ScanRegistration"),
 )
 def test_results_without_a_scene_are_refused(request, hand, name, settings, words):
     if "shape" in settings:
@@ -190,19 +188,16 @@ def test_outliers_do_not_decide_where_the_camera_stands(ball):
 BLACK, FACES = (0.0, 0.0, 0.0), torch.arange(18).reshape(6, 3)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda one: MovingMesh("ball", POINTS, FACES, POINTS[:3]), "paint of ball"),
-        (lambda one: Cloud("data", [POINTS[:, :2]], BLACK), r"frames\[0\] of data"),
-        (lambda one: Cloud("data", [POINTS], [POINTS, POINTS]), "paints of data must be 1"),
-        (lambda one: Cloud("data", [POINTS], [POINTS[:3]]), r"paints\[0\] of data"),
-        (lambda one: Curves("limbs", torch.zeros(1, 2, 3), torch.zeros(1, 3), labels=("a", "b")), "labels of limbs"),
-        (lambda one: Scene("twice", (one, one)), "different names"),
-        (lambda one: Scene("empty", ()), "got none"),
-        (lambda one: Scene("a", (Cloud("b", [POINTS] * 2, BLACK), Cloud("c", [POINTS] * 3, BLACK))), "got 2, 3"),
-        (lambda one: Scene("late", (one,), torch.arange(2.0)), "times"),
-    ],
+@each_row(
+    (lambda one: MovingMesh("ball", POINTS, FACES, POINTS[:3]), "paint of ball"),
+    (lambda one: Cloud("data", [POINTS[:, :2]], BLACK), r"frames\[0\] of data"),
+    (lambda one: Cloud("data", [POINTS], [POINTS, POINTS]), "paints of data must be 1"),
+    (lambda one: Cloud("data", [POINTS], [POINTS[:3]]), r"paints\[0\] of data"),
+    (lambda one: Curves("limbs", torch.zeros(1, 2, 3), torch.zeros(1, 3), labels=("a", "b")), "labels of limbs"),
+    (lambda one: Scene("twice", (one, one)), "different names"),
+    (lambda one: Scene("empty", ()), "got none"),
+    (lambda one: Scene("a", (Cloud("b", [POINTS] * 2, BLACK), Cloud("c", [POINTS] * 3, BLACK))), "got 2, 3"),
+    (lambda one: Scene("late", (one,), torch.arange(2.0)), "times"),
 )
 def test_layers_that_do_not_fit_are_refused(make, words):
     with pytest.raises(InputError, match=words):

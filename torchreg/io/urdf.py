@@ -18,9 +18,9 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_allowed, local_path, read_bytes
-from torchreg.io.mesh_files import MeshFiles
-from torchreg.io.strict_xml import parse_lenient_xml
+from torchreg.io.urdf_file.mesh_files import MeshFiles
 from torchreg.io.urdf_file.record import UrdfPrimitive, UrdfRecord
+from torchreg.io.urdf_file.strict_xml import parse_lenient_xml
 from torchreg.io.urdf_file.units import warn_about_lengths
 
 # Attributes of a mimic joint: added to its multiple of the other.

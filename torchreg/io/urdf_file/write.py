@@ -15,7 +15,7 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import local_path, read_bytes
-from torchreg.io.strict_xml import parse_lenient_xml
+from torchreg.io.urdf_file.strict_xml import parse_lenient_xml
 
 # Limits of effort and velocity, which the format asks for, where nothing is known.
 _UNKNOWN = {"effort": "1", "velocity": "1"}

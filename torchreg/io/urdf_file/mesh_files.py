@@ -19,7 +19,7 @@ from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.io.file_format import check_stand_in
 from torchreg.io.limits import FileLimits, read_bytes
 from torchreg.io.points import PARSER_ERRORS, load_mesh
-from torchreg.io.strict_xml import parse_xml
+from torchreg.io.urdf_file.strict_xml import parse_xml
 
 # Elements of COLLADA files without which meshes are read.
 _MATERIALS = ("library_images", "library_effects", "library_materials", "bind_material")

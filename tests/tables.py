@@ -1,5 +1,6 @@
-"""Refusals as one table a door: a row is what is given and the words of the error that it raises."""
+"""Tables of tests, a row a line: what is given and what comes of it, or the words of the error that it raises."""
 
+import inspect
 import re
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +10,21 @@ import pytest
 from torchreg.errors import FormatError
 
 
+def each_row(*table: Any) -> Callable[..., Any]:
+    """Run a test once for every row (tuple), whose entries are the test's last arguments."""
+
+    def decorate(test: Callable[..., Any]) -> Any:
+        names = list(inspect.signature(test).parameters)
+        return pytest.mark.parametrize(names[len(names) - len(table[0]) :], table)(test)
+
+    return decorate
+
+
+def each(*table: Any) -> Callable[..., Any]:
+    """Run a test once for every value of its last argument."""
+    return lambda test: pytest.mark.parametrize(list(inspect.signature(test).parameters)[-1], table)(test)
+
+
 def refusing(call: Callable[..., Any], error: Any = FormatError, *, file: str = "", leaves: int | None = None) -> Any:
     """Return the function that makes a test of rows: ``call(folder, *given)`` raises an error with given words.
 
@@ -16,8 +32,8 @@ def refusing(call: Callable[..., Any], error: Any = FormatError, *, file: str = 
     begins with, ``leaves`` how many files the folder holds afterwards.
     """
 
-    def table(*rows: tuple[Any, ...]) -> Callable[..., None]:
-        @pytest.mark.parametrize("row", rows)
+    def table(*table: tuple[Any, ...]) -> Callable[..., None]:
+        @each(*table)
         def test(tmp_path: Any, row: tuple[Any, ...]) -> None:
             *given, words = row
             expected = given.pop() if given and isinstance(given[-1], type) else error
