@@ -13,7 +13,7 @@ import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
 from torchreg.cli.cameras import DepthOptions, Seen, check_used, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.shape_argument import PackageDir, Shape, ShapeOptions
 from torchreg.cli.writers import Source, write_optional
@@ -48,12 +48,9 @@ def calibrate(
             help="Joints of a robot, a row for each of FRAMES: a line of names, then radians, metres.",
         ),
     ] = None,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written, and more."
-        ),
-    ] = Path("calibration"),
+    output: Annotated[Path, written_to("RESULT", "RESULT.safetensors and RESULT.json are written, and more.")] = Path(
+        "calibration"
+    ),
     *,
     views: DepthOptions,
     offsets: Annotated[bool, typer.Option("--offsets", help="Look for constant offsets of the joints, too.")] = False,

@@ -14,7 +14,7 @@ from torchreg.cli.align_options import FitShape, NanPolicy, Scale, fitted_shape,
 from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
 from torchreg.cli.export import Old, OldWord, check_old
 from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
-from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending
+from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import Shape, ShapeOptions
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary
@@ -79,10 +79,7 @@ def track(
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="RESULT", help="RESULT.safetensors, .json, .glb, .gif and .progress are written."
-        ),
+        Path, written_to("RESULT", "RESULT.safetensors, .json, .glb, .gif and .progress are written.")
     ] = Path("track"),
     *,
     start: Annotated[

@@ -152,6 +152,11 @@ def plain_text(content: bytes) -> bytes:
     return content.removeprefix(_UTF8_MARK)
 
 
+def warn(message: str) -> None:
+    """Say what was left out or put right; `naming` adds the file."""
+    warnings.warn(message, FileWarning, stacklevel=2)
+
+
 @contextmanager
 def naming(file: object) -> Iterator[None]:
     """Put the name of a file in front of the errors and the warnings about it."""

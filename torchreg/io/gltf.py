@@ -12,11 +12,11 @@ from torch import Tensor
 
 from torchreg.errors import ModelError
 from torchreg.io.clouds.raw_cloud import Array
-from torchreg.io.file_format import naming
+from torchreg.io.file_format import naming, warn
 from torchreg.io.gltf_file.document import GltfDocument
 from torchreg.io.gltf_file.parts import read_parts
 from torchreg.io.gltf_file.placement import place_skins
-from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface, warn
+from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface
 from torchreg.io.gltf_file.skins import Skeleton, ancestors, read_skeleton, shown_nodes
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 

@@ -19,7 +19,7 @@ from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
 from torchreg.io.clouds.npz import ARRAY_START, array_of, read_npy_header
-from torchreg.io.file_format import check_stand_in, naming
+from torchreg.io.file_format import check_stand_in, naming, warn
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.masks import mask_of_numbers, mask_of_picture
 from torchreg.io.natural_order import last_number, natural_sorted
@@ -155,7 +155,7 @@ def _unit(values: Any, scale: float | None) -> float:
         elif middle <= _SIGHT.most:
             scale = 1.0
         else:
-            _warn(f"numbers around {middle:.4g} are taken for millimeters; the camera's depth_scale says otherwise")
+            warn(f"numbers around {middle:.4g} are taken for millimeters; the camera's depth_scale says otherwise")
             scale = MILLIMETER
     depth = middle * scale
     if depth > _SIGHT.impossible:
@@ -165,15 +165,11 @@ def _unit(values: Any, scale: float | None) -> float:
         )
     if not _SIGHT.least <= depth <= _SIGHT.most:
         factor = "0.001" if depth > _SIGHT.most else "1"
-        _warn(
+        warn(
             f"depths around {depth:.3g} m are unlikely: with depth_scale {scale:g} the file's {middle:.4g} is in other "
             f"units; write depth_scale {factor} if they are {'millimeters' if depth > _SIGHT.most else 'metres'}"
         )
     return scale
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = MILLIMETER) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 import tokenize
-import warnings
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -16,13 +15,13 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import all_finite, as_float_tensor, check_choice, check_finite, check_positive, check_shape
-from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
+from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
 from torchreg.io.clouds.cloud_formats import FORMATS
 from torchreg.io.clouds.raw_cloud import Array, RawCloud, not_measured
-from torchreg.io.file_format import FileFormat, choose, naming, unpacked
+from torchreg.io.file_format import FileFormat, choose, naming, unpacked, warn
 from torchreg.io.gltf_file.glb import read_gltf
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
 
@@ -216,7 +215,7 @@ def checked_cloud(
     normals = None if normals is None else _usable_normals(normals, points, faces)
     if colors is not None and not bool(colors.isfinite().all()):
         damaged = int((~colors.isfinite()).any(-1).sum())
-        _warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
+        warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
         colors = None
     return PointCloud(points=points, normals=normals, faces=faces, colors=colors)
 
@@ -243,7 +242,7 @@ def _measured_rows(points: Tensor, faces: Tensor | None) -> Tensor:
         return torch.ones_like(measured)
     if missing == len(points):
         raise FormatError(f"all of its {missing} points are 0 0 0: nothing was measured")
-    _warn(not_measured(missing, len(points)))
+    warn(not_measured(missing, len(points)))
     return measured
 
 
@@ -279,14 +278,10 @@ def _usable_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Te
     if faces is not None and len(faces):
         told = TriangleMesh(points, faces).vertex_normals()
         if bool(told[bad].any(-1).all()):
-            _warn(f"{', '.join(counts)}; they are computed from the faces")
+            warn(f"{', '.join(counts)}; they are computed from the faces")
             return torch.where(bad.unsqueeze(-1), told, normals)
-    _warn(f"normals are left out: {', '.join(counts)}")
+    warn(f"normals are left out: {', '.join(counts)}")
     return None
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def _rows(values: Array, what: str, count: int | None) -> Tensor:
@@ -305,7 +300,7 @@ def _unit_colors(colors: Array) -> Array | None:
     known = colors[np.isfinite(colors)] if colors.dtype.kind == "f" else colors
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if low < 0 or high > 65535:
-        _warn(f"colors are left out: they run from {low:g} to {high:g}, not from 0 to 1 or 255")
+        warn(f"colors are left out: they run from {low:g} to {high:g}, not from 0 to 1 or 255")
         return None
     if colors.dtype.kind == "f" and high <= 1 + 1e-6:
         return np.clip(colors, 0.0, 1.0)

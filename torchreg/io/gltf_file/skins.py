@@ -11,8 +11,9 @@ import numpy as np
 
 from torchreg.errors import FormatError, ModelError
 from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.file_format import warn
 from torchreg.io.gltf_file.document import GltfDocument, parents_first
-from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface, warn
+from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 
 

@@ -16,7 +16,7 @@ import torch
 
 from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
-from torchreg.io.file_format import check_stand_in
+from torchreg.io.file_format import check_stand_in, warn
 from torchreg.io.limits import FileLimits, read_bytes
 from torchreg.io.points import PARSER_ERRORS, load_mesh
 from torchreg.io.urdf_file.strict_xml import parse_xml
@@ -83,7 +83,7 @@ class MeshFiles:
         if self._require:
             raise error
         if self._warn:
-            warnings.warn(f"{error}; it is left out", FileWarning, stacklevel=2)
+            warn(f"{error}; it is left out")
 
     def _candidates(self, filename: str) -> list[Path]:
         """Return the possible paths of a mesh, most likely first."""
