@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from torchreg.errors import FormatError
+import torchreg as tr
 
 
 def each_row(*table: Any) -> Callable[..., Any]:
@@ -25,7 +25,9 @@ def each(*table: Any) -> Callable[..., Any]:
     return lambda test: pytest.mark.parametrize(list(inspect.signature(test).parameters)[-1], table)(test)
 
 
-def refusing(call: Callable[..., Any], error: Any = FormatError, *, file: str = "", leaves: int | None = None) -> Any:
+def refusing(
+    call: Callable[..., Any], error: Any = tr.errors.FormatError, *, file: str = "", leaves: int | None = None
+) -> Any:
     """Return the function that makes a test of rows: ``call(folder, *given)`` raises an error with given words.
 
     A row is (*given, words), or (*given, error, words) with an error of its own. ``file`` is a name that the message

@@ -5,14 +5,13 @@ import struct
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import torchreg as tr
 from tests.io.helpers import read, refused
 from tests.tables import each, refusing, swap
 from torchreg.io.clouds.pcd import decompress_lzf
-from torchreg.io.clouds.raw_cloud import fan_triangles, strip_triangles
 from torchreg.io.limits import FileLimits
 
 FormatError, FileWarning = tr.errors.FormatError, tr.errors.FileWarning
@@ -160,26 +159,28 @@ def test_triangle_strips_are_cut_with_one_side_outward(tmp_path, kind, also_face
     assert (np.cross(b - a, c - a)[also_faces:, 2] == 1).all()
 
 
-@given(st.lists(st.lists(st.integers(-1, 5), max_size=9), max_size=4))
-def test_strips_are_those_of_a_plain_loop(strips):
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.lists(st.integers(-1, 5), max_size=9), min_size=1, max_size=4))
+def test_strips_are_those_of_a_plain_loop(tmp_path, strips):
     expected, one = [], []
     for number in [number for strip in strips for number in [*strip, -1]]:
         one = [*one, number] if number >= 0 else []
         if len(set(one[-3:])) == 3:
             a, b, c = one[-3:]
             expected.append([a, b, c] if len(one) % 2 else [b, a, c])
-    counts = np.array([len(strip) for strip in strips], np.int64)
-    indices = np.array([number for strip in strips for number in strip], np.int64)
-    assert strip_triangles(counts, indices).tolist() == expected
+    lists = "".join(" ".join(map(str, [len(strip), *strip])) + "\n" for strip in strips)
+    content = ascii_ply("x y z", np.arange(1, 19.0).reshape(6, 3), lists).replace("element face", "element tristrips")
+    faces = read(tmp_path, "a.ply", content.replace("list uchar", "list int")).faces
+    assert ([] if faces is None else faces.tolist()) == expected
 
 
-@given(st.lists(st.integers(3, 7), max_size=6), st.randoms(use_true_random=False))
-def test_fans_are_those_of_a_plain_loop(counts, random):
-    polygons = [[random.randrange(50) for _ in range(count)] for count in counts]
-    flat = np.array([corner for polygon in polygons for corner in polygon], np.int64)
-    triangles = fan_triangles(np.array(counts, np.int64), flat)
-    assert triangles.shape[1:] == (3,)
-    assert triangles.tolist() == [[p[0], p[k], p[k + 1]] for p in polygons for k in range(1, len(p) - 1)]
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.integers(3, 7), min_size=1, max_size=6), st.randoms(use_true_random=False))
+def test_fans_are_those_of_a_plain_loop(tmp_path, counts, random):
+    polygons = [[random.randrange(6) for _ in range(count)] for count in counts]
+    lists = "".join(" ".join(map(str, [len(corners), *corners])) + "\n" for corners in polygons)
+    faces = read(tmp_path, "a.ply", ascii_ply("x y z", np.arange(1, 19.0).reshape(6, 3), lists)).faces
+    assert faces.tolist() == [[p[0], p[k], p[k + 1]] for p in polygons for k in range(1, len(p) - 1)]
 
 
 @pytest.mark.parametrize("few", ["0\n", "1 0\n", "2 0 1\n"])

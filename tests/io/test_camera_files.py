@@ -11,7 +11,7 @@ from tests.io.helpers import put, refused
 from tests.tables import each_row, refusing
 from torchreg.io.calibration import load_depth_camera, save_cameras, save_depth_camera
 from torchreg.io.cameras.colmap import save_colmap
-from torchreg.io.cameras.opencv_yaml import load_opencv, save_opencv
+from torchreg.io.cameras.opencv_yaml import save_opencv
 from torchreg.io.limits import FileLimits
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
@@ -189,13 +189,14 @@ def test_cameras_as_opencv_writes_them(tmp_path):
     (found,) = tr.load_cameras(put(tmp_path, "v.yml", text + matrix("T", 1, 3, "1, 2, 3")))
     assert torch.allclose(found.world_to_camera, motion([0.1, 0.2, 0.3], [1.0, 2.0, 3.0]))
     assert (found.width, found.height) == (640, 480)
-    path = put(tmp_path, "p.yml", "%YAML:1.0\n---\n" + PAIR + matrix("T", 3, 1, "-120, 0, 0"))
-    pair = load_opencv(path, size=(640, 480), unit=1e-3)
+    step = PAIR + matrix("T", 3, 1, "-120, 0, 0")
+    pair = tr.load_cameras(put(tmp_path, "p.yml", HEAD + step), scale=1e-3)
     assert pair.names == ("left", "right")
     assert pair.stereo().baseline == pytest.approx(0.12)
     assert pair.stereo().is_rectified
-    refused((lambda: load_opencv(path), "write them into the file, as in `image_width: 640`"))
-    refused((lambda: load_opencv(path, unit=0.0), "unit must be positive"), error=InputError)
+    path = put(tmp_path, "q.yml", "%YAML:1.0\n---\n" + step)
+    refused((lambda: tr.load_cameras(path), "write them into the file, as in `image_width: 640`"))
+    refused((lambda: tr.load_cameras(path, scale=0.0), "scale must be positive"), error=InputError)
 
 
 def test_opencv_reads_what_we_write_and_we_what_it_writes(tmp_path):
@@ -216,7 +217,7 @@ def test_opencv_reads_what_we_write_and_we_what_it_writes(tmp_path):
     assert torch.allclose(found.distortion, camera.distortion, rtol=1e-15)
 
 
-test_damaged_opencv = refusing(lambda folder, text: load_opencv(put(folder, "c.yml", text)), file="c.yml")(
+test_damaged_opencv = refusing(lambda folder, text: tr.load_cameras(put(folder, "c.yml", text)), file="c.yml")(
     ("<opencv_storage>", "must begin with %YAML"),
     (HEAD, "holds neither camera_matrix nor M1"),
     (HEAD.replace("640", "64000").replace("480", "48000") + LENS, "at most 64 megapixels"),

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
+import torchreg as tr
 from tests.io.helpers import put, refused
 from tests.tables import refusing
-from torchreg.errors import InputError
-from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.swc import load_swc, save_swc
 
 
@@ -15,7 +14,7 @@ def made(seed=0, count=12):
     parents = [int(torch.randint(0, node, (1,), generator=generator)) for node in range(1, count)]
     edges = torch.tensor([[parent, node] for node, parent in enumerate(parents, start=1)])
     nodes = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    return Skeleton(nodes, edges, torch.rand(count, generator=generator, dtype=torch.float64))
+    return tr.Skeleton(nodes, edges, torch.rand(count, generator=generator, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -32,9 +31,9 @@ def test_a_tree_comes_back(tmp_path, seed):
 
 
 def test_parents_come_first_and_types_tell_ends_and_branchings(tmp_path):
-    star = Skeleton(torch.randn(4, 3), torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.ones(4))
+    star = tr.Skeleton(torch.randn(4, 3), torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.ones(4))
     save_swc(tmp_path / "a.swc", star)
-    refused((lambda: save_swc(tmp_path / "a.txt", star), r"must end in \.swc"), error=InputError)
+    refused((lambda: save_swc(tmp_path / "a.txt", star), r"must end in \.swc"), error=tr.errors.InputError)
     rows = [line.split() for line in (tmp_path / "a.swc").read_text().splitlines() if not line.startswith("#")]
     assert all(int(row[6]) < int(row[0]) for row in rows)
     assert [row[1] for row in rows] == ["6", "5", "6", "6"]

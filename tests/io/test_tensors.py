@@ -11,7 +11,6 @@ import torch
 import torchreg as tr
 from tests.io.helpers import put, refused
 from tests.tables import each, refusing
-from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.io.limits import FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.storage import load_pose
@@ -71,10 +70,10 @@ def test_every_flipped_byte_and_truncation_is_noticed(saved):
     content = saved.read_bytes()
     for place in range(0, len(content), 7):
         saved.write_bytes(content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :])
-        with pytest.raises(FormatError, match="is damaged"):
+        with pytest.raises(tr.errors.FormatError, match="is damaged"):
             load_tensors(saved)
         saved.write_bytes(content[:place])
-        with pytest.raises(FormatError, match=r"r\.safetensors: is damaged"):
+        with pytest.raises(tr.errors.FormatError, match=r"r\.safetensors: is damaged"):
             load_tensors(saved)
 
 
@@ -83,7 +82,7 @@ def test_damaged_json_is_refused(saved):
     content = beside.read_bytes()
     for place in range(0, len(content) - 2, 11):
         beside.write_bytes(content[:place])
-        with pytest.raises(FormatError, match=r"r\.json: cannot be read as JSON"):
+        with pytest.raises(tr.errors.FormatError, match=r"r\.json: cannot be read as JSON"):
             load_tensors(saved)
     for content in (b"[" * 100_000, b"\xff\xfe"):
         beside.write_bytes(content)
@@ -110,7 +109,7 @@ test_json_that_does_not_belong_is_refused = refusing(reading)(
 def test_right_checksum_of_a_damaged_file(saved):
     saved.write_bytes(b"\xff" * 40)
     rewrite(saved, lambda r: r.update(sha256=hashlib.sha256(b"\xff" * 40).hexdigest()))
-    with pytest.raises(FormatError, match="cannot be read as safetensors"):
+    with pytest.raises(tr.errors.FormatError, match="cannot be read as safetensors"):
         load_tensors(saved)
 
 
@@ -120,7 +119,10 @@ def test_what_is_missing_too_large_or_called_otherwise(saved, tmp_path):
         (lambda: save_tensors(tmp_path / "no" / "r.safetensors", {}, {}), "does not exist; create it first"),
         error=FileNotFoundError,
     )
-    refused((lambda: save_tensors(saved.with_suffix(".pt"), {}, {}), r"must end in \.safetensors"), error=InputError)
+    refused(
+        (lambda: save_tensors(saved.with_suffix(".pt"), {}, {}), r"must end in \.safetensors"),
+        error=tr.errors.InputError,
+    )
     refused(
         (lambda: load_tensors(saved, limits=FileLimits(max_bytes=100)), "the limit is 100"),
         (lambda: load_tensors("https://host/r.safetensors"), "is an address"),
@@ -130,13 +132,18 @@ def test_what_is_missing_too_large_or_called_otherwise(saved, tmp_path):
 
 
 test_what_cannot_be_saved = refusing(lambda folder, *given: save_tensors(folder / "r.safetensors", *given), leaves=0)(
-    ({"a": [1.0]}, {}, InputTypeError, r"tensors\['a'\] must be a tensor under a str, got list"),
-    ({1: torch.ones(1)}, {}, InputTypeError, r"tensors\[1\] must be"),
-    ({"a": torch.eye(2).to_sparse()}, {}, InputTypeError, "must be dense, got layout torch.sparse_coo"),
-    ({"a": torch.ones(2, dtype=torch.complex128)}, {}, InputTypeError, "tensors cannot be stored"),
-    ({}, {"h": [{"loss": torch.ones(1)}]}, InputTypeError, r"metadata\.h\[0\]\.loss must be a dict, .* got Tensor"),
-    ({}, {3: 1}, InputTypeError, "metadata must have keys of type str, got 3"),
-    ({}, {"$float": 1}, InputError, "reserved"),
+    ({"a": [1.0]}, {}, tr.errors.InputTypeError, r"tensors\['a'\] must be a tensor under a str, got list"),
+    ({1: torch.ones(1)}, {}, tr.errors.InputTypeError, r"tensors\[1\] must be"),
+    ({"a": torch.eye(2).to_sparse()}, {}, tr.errors.InputTypeError, "must be dense, got layout torch.sparse_coo"),
+    ({"a": torch.ones(2, dtype=torch.complex128)}, {}, tr.errors.InputTypeError, "tensors cannot be stored"),
+    (
+        {},
+        {"h": [{"loss": torch.ones(1)}]},
+        tr.errors.InputTypeError,
+        r"metadata\.h\[0\]\.loss must be a dict, .* got Tensor",
+    ),
+    ({}, {3: 1}, tr.errors.InputTypeError, "metadata must have keys of type str, got 3"),
+    ({}, {"$float": 1}, tr.errors.InputError, "reserved"),
 )
 
 
@@ -149,5 +156,5 @@ def test_poses_in_json_that_are_refused(tmp_path, content):
 @pytest.mark.parametrize(("poses", "costs"), [((2, 27), (3,)), ((21, 3), (2,)), ((), (2,))])
 def test_results_whose_shapes_do_not_fit_are_refused(tmp_path, poses, costs):
     tr.PoseStarts(torch.zeros(poses), torch.zeros(costs), torch.ones(())).save(tmp_path / "a.safetensors")
-    with pytest.raises(FormatError, match=r"poses|costs"):
+    with pytest.raises(tr.errors.FormatError, match=r"poses|costs"):
         tr.load(tmp_path / "a.safetensors")

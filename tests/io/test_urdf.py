@@ -16,7 +16,7 @@ from tests.io.helpers import put, refused
 from tests.tables import refusing
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 from torchreg.io.urdf import load_urdf
-from torchreg.io.urdf_file.mesh_files import MeshFiles
+from torchreg.io.urdf_file import mesh_files
 
 FileWarning, FormatError, ModelError = tr.errors.FileWarning, tr.errors.FormatError, tr.errors.ModelError
 BOX = "<box size='0.1 0.08 0.4'/>"
@@ -207,6 +207,13 @@ test_impossible_robots = refusing(load, ModelError, file="robot.urdf")(
 )  # fmt: skip
 test_damaged_files = refusing(load, file="robot.urdf")(
     ("<robot>", "not well-formed XML"),
+    *(
+        (b"<?xml version='1.0' encoding='klingon'?><robot/>", "not well-formed XML"),
+        (b"<robot>\xff</robot>", "not well"),
+    ),
+    ("<!DOCTYPE robot [<!ENTITY a 'b'>]><robot>&a;</robot>", r"document type declaration \('robot'\)"),
+    ("<robot>" + "<a>" * 64 + "</a>" * 64 + "</robot>", "nests elements more than 64 deep"),
+    ("<robot>" + "<a>" * 63 + "</a>" * 63 + "</robot>", ModelError, "1 to 2000 links, got 0"),
     ("<sdf/>", "must be <robot>, got <sdf>"),
     ("<robot xmlns:xacro='http://www.ros.org/wiki/xacro'><xacro:macro name='m'/></robot>", "expand them first"),
     ("<robot><link name='${prefix}a'/></robot>", "expand them first"),
@@ -267,9 +274,10 @@ def folder(tmp_path):
     return tmp_path / "robot"
 
 
-def mesh(folder, name, package_dirs=(), require=True, limits=None):
-    found = MeshFiles(folder / "robot.urdf", list(package_dirs), require, limits or FileLimits())
-    return found.read(name, "a")
+def mesh(folder, name, package_dirs=(), require=True, **options):
+    """Return the mesh of a robot's only link."""
+    options |= {"package_dirs": package_dirs, "meshes": "require" if require else "skip"}
+    return load(folder, with_mesh(name), **options).link_meshes[0]
 
 
 def width(mesh):
@@ -290,7 +298,7 @@ def test_names_of_meshes_are_places_addresses_or_packages(folder, tmp_path):
     trimesh.creation.box(extents=(3, 1, 1)).export(mine / "box.stl")
     assert width(mesh(folder, "package://robot/box.stl", [mine])) == 3  # given folders come first
     refused(
-        (lambda: mesh(away, name), r"a: mesh file 'package://other/box\.stl' was not found \(looked at "),
+        (lambda: mesh(away, name), r"mesh file 'package://other/box\.stl' was not found \(looked at "),
         (lambda: mesh(folder, "https://example.org/ball.stl"), "is remote; save it beside the URDF"),
         (lambda: mesh(folder, "box.stl", limits=FileLimits(max_bytes=100)), "the limit is 100"),
     )
@@ -299,12 +307,12 @@ def test_names_of_meshes_are_places_addresses_or_packages(folder, tmp_path):
         assert mesh(folder, gone, require=False) is None
 
 
-def test_files_are_read_once_and_scenes_are_put_together(folder):
-    found = MeshFiles(folder / "robot.urdf", [], True, FileLimits())
-    first = found.read("box.stl", "a")
-    put(folder, "box.stl", b"damaged since")
-    assert found.read("box.stl", "b") is first
-    assert first.vertices.dtype == torch.float64
+def test_files_are_read_once_and_scenes_are_put_together(folder, monkeypatch):
+    box, read, names = "<mesh filename='box.stl'/>", mesh_files.read_bytes, []
+    monkeypatch.setattr(mesh_files, "read_bytes", lambda path, *more: names.append(path.name) or read(path, *more))
+    found = load(folder, robot(link("a", box), link("b", box), joint("j", "a", "b"))).link_meshes
+    assert names == ["box.stl"]
+    assert [part.vertices.dtype for part in found] == [torch.float64] * 2
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([3, 0, 0]))
     scene.add_geometry(trimesh.creation.box())
@@ -318,7 +326,7 @@ def test_collada_comes_in_metres_and_without_its_looks(folder, monkeypatch):
     put(folder, "box.dae", b"<COLLADA/>")
     with monkeypatch.context() as patch:
         patch.setattr("importlib.util.find_spec", lambda name: None)
-        words = r"a: .*torchreg-articulated\[urdf\]"
+        words = r".*torchreg-articulated\[urdf\]"
         refused((lambda: mesh(folder, "box.dae"), words), error=tr.errors.MissingExtraError)
         assert mesh(folder, "box.dae", require=False) is None
     pytest.importorskip("collada")
