@@ -13,7 +13,6 @@ from tests.tables import each, refusing
 from torchreg.io.frames import save_frames
 from torchreg.io.images import list_frames, list_pictures
 from torchreg.io.limits import FileLimits
-from torchreg.io.natural_order import natural_sorted
 from torchreg.io.points import save_points
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
@@ -117,8 +116,11 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
     ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
 )
-def test_names_sort_as_a_person_would(names):
-    assert natural_sorted(reversed(names)) == names
+def test_names_sort_as_a_person_would(tmp_path, names):
+    pictures = [f"{name.rpartition('.')[0]}.png" for name in names]
+    for name in pictures:
+        (tmp_path / name).touch()
+    assert [path.name for path in list_pictures(tmp_path)] == pictures
 
 
 @pytest.mark.parametrize("name", ["points", "vertices", "whatever"])
