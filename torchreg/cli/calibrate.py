@@ -75,9 +75,9 @@ def calibrate(
     Of a robot RESULT_transform.json holds the base, what is known of it and ROS's static transform,
     RESULT_handeye.yaml the camera as easy_handeye and MoveIt read it, and RESULT_seen a picture of the robot over each
     frame. Joints whose names are those of the robot's file are read; offsets of joints
-    that the frames do not tell stay zero.
+    that the frames do not determine stay zero.
 
-    A hand is searched in every cloud. Clouds in which it is not surely found are told and left out.
+    A hand is searched in every cloud. Clouds in which it is not surely found are named and left out.
 
     Exit codes: 0; 1 if no frame shows the robot, hardly any the hand, or an output beside the result could not be
     written; 2 for an error; 130 for Ctrl-C.
@@ -164,7 +164,7 @@ def _calibrate_hand(
     from torchreg.alignment.calibrate import calibrate as fit
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FramesWarning)  # told below, by the names of files
+        warnings.simplefilter("ignore", FramesWarning)  # reported below, by the names of files
         found = fit(shape, clouds)
     found.save(output)
     if found.outliers:

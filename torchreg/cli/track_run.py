@@ -286,7 +286,7 @@ class TrackRun:
 
     @cached_property
     def _overlays(self) -> list[tuple[OptionalOutput, OnFrame]]:
-        """What draws each frame as soon as it is done; made after the first, which tells who is fitted."""
+        """What draws each frame as soon as it is done; made after the first, when the fitted shape is known."""
         drawn = []
         pictures = None if self.files.pictures is None else self._drawn
         for name, begin in (("what was seen", self.seen), ("the page", self.live), ("--pictures", pictures)):
@@ -316,7 +316,7 @@ def summary(result: TrackResult) -> str:
     usable = sum(status.usable for status in result.statuses)
     unusable = Counter(status.value for status in result.statuses if not status.usable)
     counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in unusable.items())]
-    # The mean tells of searches rather than of frames.
+    # Searches dominate the mean.
     usual = 1e3 * float(result.seconds.median())
     number = f"{len(result.statuses)} frame{'s' * (len(result.statuses) > 1)}"
     return f"{number}: {', '.join(counts)}; {usual:.0f} ms per frame"

@@ -13,7 +13,7 @@ from torchreg.io.file_format import warn
 
 @dataclass(frozen=True)
 class _Labels:
-    """How pictures of labels are told from masks with soft edges and halos."""
+    """What distinguishes pictures of labels from masks with soft edges and halos."""
 
     interior: float = 0.5  # share of the pixels between dark and bright whose four neighbors are equal to them
     # Of a halo, which has regions of one value too: labels are fewer, touch what is around them, and are larger.

@@ -88,7 +88,7 @@ def load_points(
 ) -> PointCloud:
     """Return the points of a file, with normals, faces and colors where it has them.
 
-    The format is told by the content, and by the ending where content does not tell; ``torchreg formats`` lists them.
+    The content decides on the format, or the ending where the content does not; ``torchreg formats`` lists the formats.
     Files may be packed by gzip. Points keep the order and the unit of the file. What cannot be used - normals that are
     not finite or zero, faces of two corners, colors of some vertices only, and points 0 0 0, where organized clouds and
     padded ones have nothing - is left out with a warning that counts it; a single point at the origin stays.
@@ -137,7 +137,7 @@ def load_points(
 
 
 def _clip(kind: FileFormat, time: float | None, frame: int | None) -> dict[str, Any]:
-    """Return the options of a reader that tell a time; InputError if it has none."""
+    """Return the options of a reader that choose a time; InputError if it has none."""
     given = {name: value for name, value in (("time", time), ("frame", frame)) if value is not None}
     if given and kind.read is not read_gltf:
         raise InputError(f"{' and '.join(given)} choose a moment of an animation, which {kind.name} files do not have")
@@ -199,8 +199,8 @@ def checked_cloud(
     if count == 0 and not may_be_empty:
         raise FormatError("holds no points")
     normals = None if raw.normals is None else _rows(raw.normals, "normals", count)
-    told = None if raw.colors is None else _unit_colors(raw.colors)
-    colors = None if told is None else _rows(told, "colors", count)
+    shares = None if raw.colors is None else _unit_colors(raw.colors)
+    colors = None if shares is None else _rows(shares, "colors", count)
     faces = None if raw.faces is None else _face_rows(raw.faces, count, limits)
     measured = _measured_rows(points, faces)
     points, normals, colors, faces = _of_rows(measured, points, normals, colors, faces)
@@ -276,10 +276,10 @@ def _usable_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Te
     counts = [f"{int(rows.sum())} of {len(normals)} normals are {what}" for rows, what in
               ((infinite, "not finite"), (zero, "of length zero")) if bool(rows.any())]  # fmt: skip
     if faces is not None and len(faces):
-        told = TriangleMesh(points, faces).vertex_normals()
-        if bool(told[bad].any(-1).all()):
+        computed = TriangleMesh(points, faces).vertex_normals()
+        if bool(computed[bad].any(-1).all()):
             warn(f"{', '.join(counts)}; they are computed from the faces")
-            return torch.where(bad.unsqueeze(-1), told, normals)
+            return torch.where(bad.unsqueeze(-1), computed, normals)
     warn(f"normals are left out: {', '.join(counts)}")
     return None
 

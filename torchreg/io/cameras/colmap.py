@@ -129,7 +129,7 @@ def _images(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
 
 
 def _is_image(line: str) -> bool:
-    """Return whether a line tells of an image: two whole numbers at their places, and not points in triples."""
+    """Return whether a line describes an image: two whole numbers at their places, and not points in triples."""
     words = line.split()
     if len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
         return False

@@ -30,7 +30,7 @@ class RawCloud:
 
 
 def not_measured(missing: int, count: int, where: str = "") -> str:
-    """Return the sentence that tells of rows that are left out, as depth cameras and padding leave them."""
+    """Return the sentence about rows that are left out, as depth cameras and padding leave them."""
     return f"{missing} of {count} points{where} are 0 0 0, where nothing was measured; they are left out"
 
 

@@ -16,7 +16,7 @@ from torchreg.io.limits import FileLimits, check_allowed
 _COMMENT = re.compile(rb"(#|//).*")
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _FIELDS = re.compile(rb"[;\s]+")
-# Lines by which the separator is told.
+# Lines that decide on the separator.
 _TOLD_BY = 50
 
 

@@ -38,7 +38,7 @@ class _Rounding:
     """Rounding of positions in single precision."""
 
     position: float = 1e-6  # of the skeleton's extent: shorter bones have no direction
-    turn: float = 1e-3  # of a bone's length, by which its end may lie beside its old direction
+    turn: float = 1e-3  # of a bone's length, by which its end may deviate from its old direction
 
 
 _ROUNDING = _Rounding()
@@ -70,7 +70,7 @@ def save_refitted_rig(
     """
     target, file = checked_path(path), local_path(source)
     with warnings.catch_warnings(), naming(file):
-        warnings.simplefilter("ignore", FileWarning)  # what reading the rig told before
+        warnings.simplefilter("ignore", FileWarning)  # what was warned of when the rig was read
         rig = load_rig(file, skin=skin)
         document = GltfDocument(read_bytes(file, DEFAULT_LIMITS), file, DEFAULT_LIMITS)
         if set(positions) != set(rig.joint_names) or len(vertices) != len(rig.vertices):
@@ -158,7 +158,7 @@ class _Rewriter:
         return {key: view[key] for key in ("name", "byteStride", "target") if key in view} | placed
 
     def _embed_pictures(self) -> None:
-        """Take pictures beside the file into it; where one is not there, its address stays."""
+        """Embed pictures that are separate files; where one is not there, its address stays."""
         for image in self.document.items("images"):
             uri = image.get("uri")
             if not isinstance(uri, str) or uri.startswith("data:"):

@@ -79,7 +79,7 @@ class MeshFiles:
             return load_mesh(file, limits=self._limits, dtype=torch.float64)
 
     def _missing(self, error: FormatError | MissingExtraError) -> None:
-        """Raise the error about a file that is not there, or tell it, as was asked for."""
+        """Raise the error about a missing file, or warn, as was asked for."""
         if self._require:
             raise error
         if self._warn:
