@@ -48,6 +48,13 @@ def refusing(
     return table
 
 
+def refused(*rows: tuple[Callable[[], Any], str | None], error: Any = tr.errors.FormatError) -> None:
+    """Make each (call, words) of a table raise."""
+    for call, words in rows:
+        with pytest.raises(error, match=words):
+            call()
+
+
 def swap(whole: str, old: str, new: str) -> str:
     """Return a text with a first piece replaced, which must be there."""
     assert old in whole

@@ -6,7 +6,6 @@ import struct
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 import torchreg as tr
@@ -25,13 +24,6 @@ def put(folder, name, content):
 def read(folder, name, content, **options):
     """Write a file and return its cloud in double precision."""
     return tr.load_points(put(folder, name, content), **{"dtype": torch.float64, **options})
-
-
-def refused(*rows, error=tr.errors.FormatError):
-    """Make each (call, words) of a table raise."""
-    for call, words in rows:
-        with pytest.raises(error, match=words):
-            call()
 
 
 def bar(height=2.0, thick=0.3, rings=9, unit=1.0):

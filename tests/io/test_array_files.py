@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.io.helpers import put, read, refused
-from tests.tables import each, refusing
+from tests.io.helpers import put, read
+from tests.tables import each, refused, refusing
 from torchreg.io.images import load_depth, load_mask
 from torchreg.io.limits import FileLimits
 from torchreg.io.points import save_points

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import torchreg as tr
-from tests.io.helpers import read, refused
-from tests.tables import each, refusing, swap
+from tests.io.helpers import read
+from tests.tables import each, refused, refusing, swap
 from torchreg.io.clouds.pcd import decompress_lzf
 from torchreg.io.limits import FileLimits
 

@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import each_row, refusing
+from tests.io.helpers import put
+from tests.tables import each_row, refused, refusing
 from torchreg.io.calibration import load_depth_camera, save_cameras, save_depth_camera
 from torchreg.io.cameras.colmap import save_colmap
 from torchreg.io.cameras.opencv_yaml import save_opencv

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import each, each_row, refusing
+from tests.io.helpers import put
+from tests.tables import each, each_row, refused, refusing
 from torchreg.io.calibration import load_depth_camera
 
 FileWarning, FormatError = tr.errors.FileWarning, tr.errors.FormatError

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
 from tests.io.test_array_files import header
-from tests.tables import each, refusing
+from tests.tables import each, refused, refusing
 from torchreg.io.frames import save_frames
 from torchreg.io.images import list_frames, list_pictures
 from torchreg.io.limits import FileLimits

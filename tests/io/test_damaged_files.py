@@ -14,9 +14,9 @@ import torch
 import trimesh
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
 from tests.io.test_binary_clouds import QUAD, pcd, ply, stl, stl_text
-from tests.tables import each
+from tests.tables import each, refused
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.limits import FileLimits
 from torchreg.io.points import save_points

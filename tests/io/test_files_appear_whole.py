@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
+from tests.tables import refused
 from torchreg.io.atomic import write_atomic
 
 

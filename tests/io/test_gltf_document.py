@@ -10,8 +10,7 @@ import pytest
 
 import torchreg as tr
 from tests.gltf_player import KINDS, TYPES
-from tests.io.helpers import refused
-from tests.tables import refusing
+from tests.tables import refused, refusing
 from torchreg.io.gltf_file.document import GltfDocument
 from torchreg.io.limits import FileLimits
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import FACES, UPPER, Scene, put, refused, shift
-from tests.tables import refusing
+from tests.io.helpers import FACES, UPPER, Scene, put, shift
+from tests.tables import refused, refusing
 from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.io.limits import FILE_BUDGET, FileLimits

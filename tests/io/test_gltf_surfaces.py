@@ -10,8 +10,8 @@ import torch
 import trimesh
 
 import torchreg as tr
-from tests.io.helpers import TURN, UPPER, VERTICES, Scene, bar, put, read, refused, shift
-from tests.tables import each, each_row, refusing
+from tests.io.helpers import TURN, UPPER, VERTICES, Scene, bar, put, read, shift
+from tests.tables import each, each_row, refused, refusing
 from torchreg.io.limits import FileLimits
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError

@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import each, each_row, refusing
+from tests.io.helpers import put
+from tests.tables import each, each_row, refused, refusing
 from torchreg.io.calibration import load_depth_camera
 from torchreg.io.images import list_frames, list_pictures, load_depth, load_image, load_mask, save_depth, save_image
 from torchreg.io.limits import FileLimits

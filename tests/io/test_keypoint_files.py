@@ -2,8 +2,8 @@
 
 import torch
 
-from tests.io.helpers import put, refused
-from tests.tables import refusing
+from tests.io.helpers import put
+from tests.tables import refused, refusing
 from torchreg.io.keypoints import load_keypoints
 
 

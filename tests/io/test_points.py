@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import each_row, refusing
+from tests.io.helpers import put
+from tests.tables import each_row, refused, refusing
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.frames import save_frames
 from torchreg.io.limits import FileLimits

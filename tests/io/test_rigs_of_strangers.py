@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import FACES, TURN, UPPER, VERTICES, Scene, refused, shift
-from tests.tables import each_row
+from tests.io.helpers import FACES, TURN, UPPER, VERTICES, Scene, shift
+from tests.tables import each_row, refused
 from torchreg.io.gltf import load_rig
 
 FileWarning = tr.errors.FileWarning

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import refusing
+from tests.io.helpers import put
+from tests.tables import refused, refusing
 from torchreg.io.swc import load_swc, save_swc
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import each, refusing
+from tests.io.helpers import put
+from tests.tables import each, refused, refusing
 from torchreg.io.limits import FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.storage import load_pose

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import torchreg as tr
-from tests.io.helpers import read, refused
-from tests.tables import each, each_row, refusing
+from tests.io.helpers import read
+from tests.tables import each, each_row, refused, refusing
 from torchreg.io.limits import FileLimits
 from torchreg.io.points import save_points
 

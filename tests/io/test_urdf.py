@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import put, refused
-from tests.tables import refusing
+from tests.io.helpers import put
+from tests.tables import refused, refusing
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 from torchreg.io.urdf import load_urdf
 from torchreg.io.urdf_file import mesh_files

@@ -6,9 +6,9 @@ import pytest
 import trimesh
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
 from tests.io.test_urdf import link, robot
-from tests.tables import each, each_row
+from tests.tables import each, each_row, refused
 from torchreg.io.urdf import load_urdf
 
 FileWarning, UnitsWarning = tr.errors.FileWarning, tr.errors.UnitsWarning

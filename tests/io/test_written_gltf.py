@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import torchreg as tr
 from tests.gltf_player import Player
-from tests.io.helpers import refused
-from tests.tables import refusing
+from tests.tables import refused, refusing
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf_file.morph import save_vertex_animation
 from torchreg.io.gltf_write import save_animated_parts, save_animated_skin

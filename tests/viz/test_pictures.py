@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import torchreg as tr
-from tests.tables import each_row
+from tests.tables import each_row, refused, refusing
 from torchreg.viz import animation, figures, spines, tracking
 from torchreg.viz import scene as sc
 from torchreg.viz.result_scenes import result_scene
@@ -167,14 +167,13 @@ def test_pictures_of_the_documentation_show_a_finger_per_sharpness(tmp_path):
     assert dull > 2 * sharp > 0
     figure, _ = figures.new_figure(20, 20)
     assert png_size(figures.save_picture(figure, tmp_path / "a.png", dpi=200)) == (40, 40)
-    for error, words, call in (
-        (InputError, "sharpness must hold at least one", lambda: figures.bending_picture(path, ())),
-        (InputError, "sharpness must be positive", lambda: figures.bending_picture(path, (-1.0,))),
-        (InputError, r"\.pdf or \.svg, got 'a\.x'", lambda: figures.save_picture(figure, tmp_path / "a.x")),
-        (FileNotFoundError, "does not exist", lambda: figures.save_picture(figure, tmp_path / "none" / "a.png")),
-    ):  # fmt: skip
-        with pytest.raises(error, match=words):
-            call()
+    refused(
+        (lambda: figures.bending_picture(path, ()), "sharpness must hold at least one"),
+        (lambda: figures.bending_picture(path, (-1.0,)), "sharpness must be positive"),
+        (lambda: figures.save_picture(figure, tmp_path / "a.x"), r"\.pdf or \.svg, got 'a\.x'"),
+        error=InputError,
+    )
+    refused((lambda: figures.save_picture(figure, tmp_path / "none/a.png"), "does not exist"), error=FileNotFoundError)
 
 
 @pytest.mark.parametrize("frames", [1, 3])
@@ -262,7 +261,10 @@ def test_an_interruption_leaves_the_frames_so_far_and_a_failing_frame_no_file(to
     assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
 
 
-@each_row(
+test_animations_that_are_refused = refusing(
+    lambda folder, frames, name, fps: animation.save_animation(folder / name, frames, fps),
+    (InputError, FileNotFoundError),
+)(
     ([], "a.gif", 20, "frames must hold at least one frame"),
     ([plain(0)], "a.avi", 20, r"path must end in \.gif or \.mp4, got 'a\.avi'"),
     ([plain(0)], "none/a.gif", 20, "does not exist"),
@@ -271,9 +273,6 @@ def test_an_interruption_leaves_the_frames_so_far_and_a_failing_frame_no_file(to
     ([np.full((4, 4, 3), 7.0)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
     ([np.full((4, 4, 3), np.nan)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
 )
-def test_save_animation_refuses(tmp_path, frames, name, fps, message):
-    with pytest.raises((InputError, FileNotFoundError), match=message):
-        animation.save_animation(tmp_path / name, frames, fps)
 
 
 @pytest.fixture
