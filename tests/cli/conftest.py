@@ -40,6 +40,18 @@ def run():
 
 
 @pytest.fixture(scope="session")
+def done(run):
+    """Return the function that runs a command, which must succeed, and gives what it prints."""
+
+    def done(*arguments):
+        answer = run(*arguments)
+        assert answer.exit_code == 0, answer.output
+        return answer.output
+
+    return done
+
+
+@pytest.fixture(scope="session")
 def error_of(run):
     """Return the function that gives the one line with which a command fails."""
 

@@ -18,35 +18,22 @@ BASE[:3, :3] = torch.from_numpy(Rotation.from_rotvec([1.7, 0.3, -0.2]).as_matrix
 BASE[:3, 3] = torch.tensor([0.1, 0.2, 1.1])
 
 
+def write_clouds(folder, robot, link=0):
+    """Write two clouds of the robot's side towards a camera that a link carries, and the table of its joints."""
+    arm = tr.ArticulatedShape.from_urdf(robot)
+    skin, files = arm.file_skin(), [folder / "robot0.ply", folder / "robot1.ply"]
+    for file, joints in zip(files, [(0.6, 0.05), (-0.9, 0.2)], strict=True):
+        pose = torch.tensor([0.0] * 6 + list(joints))
+        to_camera = BASE @ arm.part_transforms(pose)[link].inverse()
+        vertices = skin(pose) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        save_points(file, sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0])
+    (folder / "joints.csv").write_text("shoulder,rail,time\n0.6,0.05,0\n-0.9,0.2,1\n")
+    return files
+
+
 @pytest.fixture(scope="module")
 def clouds(folder):
-    """Two clouds of the robot's side towards the camera, and the table of its joints."""
-    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
-    skin = arm.file_skin()
-    lines = ["shoulder,rail,time"]
-    for number, (shoulder, rail) in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
-        vertices = skin(torch.tensor([0.0] * 6 + [shoulder, rail])) @ BASE[:3, :3].T + BASE[:3, 3]
-        points = sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
-        save_points(folder / f"robot{number}.ply", points)
-        lines.append(f"{shoulder},{rail},{number}")
-    (folder / "joints.csv").write_text("\n".join(lines) + "\n")
-    return [folder / "robot0.ply", folder / "robot1.ply"]
-
-
-def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, tmp_path):
-    answer = run(
-        "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
-    )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
-    assert "base within" in answer.output
-    written = json.loads((tmp_path / "base_transform.json").read_text())
-    found = tr.load(tmp_path / "base.safetensors")
-    assert written["T_camera_base"] == found.T_camera_base.tolist()
-    assert "static_transform_publisher --x" in written["ros2"]
-    assert written["ros2"].endswith("--child-frame-id base")
-    assert list(written["offsets"]) == ["shoulder", "rail"]
-    torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
-    assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
+    return write_clouds(folder, folder / "arm.urdf")
 
 
 def transform_of(path):
@@ -59,42 +46,37 @@ def transform_of(path):
     return placed, joint.find("parent").get("link")
 
 
-def test_the_camera_joins_the_robot_in_its_file_and_for_easy_handeye(run, folder, clouds, tmp_path):
-    answer = run(
+def test_the_base_is_written_for_ros_for_easy_handeye_and_into_the_file_of_the_robot(done, folder, clouds, tmp_path):
+    output = done(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base",
         "--urdf-out", tmp_path / "seen.urdf",
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
-    inverse = tr.load(tmp_path / "base.safetensors").T_camera_base.inverse()
+    assert "base within" in output
+    written, found = json.loads((tmp_path / "base_transform.json").read_text()), tr.load(tmp_path / "base.safetensors")
+    assert written["T_camera_base"] == found.T_camera_base.tolist()
+    assert "static_transform_publisher --x" in written["ros2"]
+    assert written["ros2"].endswith("--child-frame-id base")
+    assert list(written["offsets"]) == ["shoulder", "rail"]
+    torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
+    assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
+    inverse = found.T_camera_base.inverse()
     placed, parent = transform_of(tmp_path / "seen.urdf")
     torch.testing.assert_close(placed, inverse)
     assert parent == "base"
     assert tr.ArticulatedShape.from_urdf(tmp_path / "seen.urdf").dof_names[6:] == ("shoulder", "rail")
     written = yaml_numbers(tmp_path / "base_handeye.yaml")
-    assert written["eye_on_hand"] == "false"
-    assert written["robot_base_frame"] == '"base"'
+    assert (written["eye_on_hand"], written["robot_base_frame"]) == ("false", '"base"')
     quaternion = [float(written[name]) for name in ("qx", "qy", "qz", "qw")]
     torch.testing.assert_close(torch.from_numpy(Rotation.from_quat(quaternion).as_matrix()), inverse[:3, :3])
     assert [float(written[name]) for name in "xyz"] == pytest.approx(inverse[:3, 3].tolist())
 
 
-def test_a_camera_on_a_link_joins_this_link(run, folder, tmp_path):
-    arm = tr.ArticulatedShape.from_urdf(folder / "arm.urdf")
-    skin, files = arm.file_skin(), []
-    for number, joints in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
-        pose = torch.tensor([0.0] * 6 + list(joints))
-        to_camera = BASE @ arm.part_transforms(pose)[1].inverse()
-        vertices = skin(pose) @ to_camera[:3, :3].T + to_camera[:3, 3]
-        save_points(
-            tmp_path / f"{number}.ply", sample_visible(tr.TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
-        )
-        files.append(tmp_path / f"{number}.ply")
-    (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.9,0.2\n")
-    answer = run(
+def test_a_camera_on_a_link_joins_this_link(done, folder, tmp_path):
+    files = write_clouds(tmp_path, folder / "arm.urdf", 1)
+    done(
         "calibrate", folder / "arm.urdf", *files, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base",
         "--camera-link", "upper", "--urdf-out", tmp_path / "seen.urdf",
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
     found = tr.load(tmp_path / "base.safetensors")
     torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
     placed, parent = transform_of(tmp_path / "seen.urdf")
@@ -109,13 +91,12 @@ def yaml_numbers(path):
     return dict(line.strip().split(": ", 1) for line in path.read_text().splitlines() if ": " in line)
 
 
-def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(run, folder, clouds, tmp_path):
+def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(done, folder, clouds, tmp_path):
     (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.5,0.2\n")
-    answer = run(
+    output = done(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base"
     )  # fmt: skip
-    assert answer.exit_code == 0, answer.output
-    assert "or in other joints: robot1.ply" in answer.output
+    assert "or in other joints: robot1.ply" in output
     assert json.loads((tmp_path / "base_transform.json").read_text())["outliers"] == [1]
 
 
@@ -134,30 +115,25 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     robot, output = folder / "arm.urdf", ["-o", tmp_path / "out"]
     table = tmp_path / "joints.csv"
     assert "takes --joints TABLE.csv" in error_of("calibrate", robot, *clouds, *output)
-    table.write_text("shoulder,arm\n0.1,0.2\n0.1,0.2\n")
-    named = error_of("calibrate", robot, *clouds, "--joints", table, *output)
-    assert "has no column rail; the robot's joints are shoulder, rail" in named
-    table.write_text("shoulder,rail\n0.1,0.2\n")
-    assert "a row for every frame, 2, got 1" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
-    table.write_text("shoulder,rail\n34.0,0.2\n-50.0,0.2\n")
-    assert "as degrees all would fit" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
-    hand = error_of("calibrate", "hand", *clouds, "--joints", table, *output)
-    assert "--joints has no meaning without a robot" in hand
-    masks = error_of("calibrate", robot, *clouds, "--joints", table, "--mask", table, *output)
-    assert "--mask has no meaning without --depth" in masks
+    for rows, message in (
+        ("shoulder,arm\n0.1,0.2\n0.1,0.2\n", "has no column rail; the robot's joints are shoulder, rail"),
+        ("shoulder,rail\n0.1,0.2\n", "a row for every frame, 2, got 1"),
+        ("shoulder,rail\n34.0,0.2\n-50.0,0.2\n", "as degrees all would fit"),
+    ):
+        table.write_text(rows)
+        assert message in error_of("calibrate", robot, *clouds, "--joints", table, *output)
+    given = *clouds, "--joints", table, *output
+    assert "--joints has no meaning without a robot" in error_of("calibrate", "hand", *given)
+    assert "--mask has no meaning without --depth" in error_of("calibrate", robot, *given, "--mask", table)
 
 
-def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(run, folder, tmp_path, monkeypatch):
+def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(done, folder, tmp_path, monkeypatch):
     clouds = folder / "cloud0.ply", folder / "cloud3.ply"
-    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand")
-    assert answer.exit_code == 0, answer.output
-    assert float(re.search(r"lengths ([\d.]+) times those of the shape", answer.output)[1]) == pytest.approx(
-        1, abs=0.05
-    )
+    output = done("calibrate", "hand", *clouds, "-o", tmp_path / "hand")
+    assert float(re.search(r"lengths ([\d.]+) times those of the shape", output)[1]) == pytest.approx(1, abs=0.05)
     found = tr.load(tmp_path / "hand.safetensors")
     assert found.poses.shape == (2, 27)
     doubtful = replace(found, outliers=(1,), status=tr.Status.WITH_WARNINGS)
     monkeypatch.setattr("torchreg.alignment.calibrate.calibrate", lambda *given: doubtful)
-    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
-    assert answer.exit_code == 0
-    assert answer.output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"
+    output = done("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
+    assert output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"

@@ -12,13 +12,13 @@ def test_the_demonstration_runs(run, tmp_path):
     out = tmp_path / "made" / "demo"
     answer = run("demo", "--frames", "3", "-o", out)
     assert answer.exit_code == 0, answer.output
+    lines = answer.stdout.splitlines()
     names = ["hand.glb", "poses.json", "track.json", "track.safetensors", "tracking.gif"]
     assert sorted(path.name for path in out.iterdir()) == names
     result = tr.load(out / "track.safetensors")
     poses = json.loads((out / "poses.json").read_text(encoding="utf-8"))
     assert tuple(poses["poses"]) == tr.Hand().dof_names
     assert poses["poses"]["index_pip_flexion"] == result.track.named_poses["index_pip_flexion"].tolist()
-    lines = answer.stdout.splitlines()
     first, second, third = result.track.seconds.tolist()
     sizes = [len(cloud) for cloud in result.clouds]
     speed = f"{first:.1f} s to find the hand in the first, then {2 / (second + third):.1f} frames/s"

@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 
 import torchreg as tr
+from tests.tables import each_row
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +42,6 @@ def results(registered, starfish, folder, plain_hand, plain_hand_skin, tmp_path_
     return place
 
 
-def read_json(path):
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
 def read_table(path):
     lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
     return lines[0], lines[1:]
@@ -53,10 +50,6 @@ def read_table(path):
 def read_picture(path):
     with Image.open(path) as file:
         return getattr(file, "n_frames", 1), np.asarray(file.convert("L")).std() > 1
-
-
-def pose_by_name(found):
-    return dict(zip(found.shape.dof_names, found.pose.tolist(), strict=True))
 
 
 def is_table_of_poses(found, path):
@@ -83,8 +76,16 @@ def is_swc(found, path):
     return True
 
 
-def moves(path):
-    """Return how many nodes a glTF viewer finds, and of how many triangles."""
+def is_pose(found, path):
+    return json.loads(path.read_text()) == dict(zip(found.shape.dof_names, found.pose.tolist(), strict=True))
+
+
+def is_drawn(found, path):
+    return read_picture(path) == (1, True)
+
+
+def moves(found, path):
+    """Return whether a glTF viewer finds nodes, and many triangles."""
     scene = trimesh.load_scene(path)
     return len(scene.graph.nodes) > 2 and sum(len(mesh.faces) for mesh in scene.geometry.values()) > 100
 
@@ -101,50 +102,43 @@ def arrays(path):
         return {name: archive[name] for name in archive.files}
 
 
-PLAIN, FRAMES = (1, True), (3, True)
-
-
-@pytest.mark.parametrize(
-    ("name", "file", "options", "check"),
-    [
-        ("aligned0", "a.json", (), lambda found, path: read_json(path) == pose_by_name(found)),
-        ("aligned0", "a.csv", (), is_table_of_poses),
-        ("aligned0", "a.ply", (), lambda found, path: holds(path, found.registered)[0]),
-        ("aligned0", "a.glb", (), lambda found, path: moves(path)),
-        ("aligned0", "a.png", ("cloud0.ply",), lambda found, path: read_picture(path) == PLAIN),
-        ("aligned0", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["pose"], found.pose)),
-        ("tracked", "a.json", (), lambda found, path: read_json(path)["poses"]["base_x"] == found.poses[:, 0].tolist()),
-        ("tracked", "a.csv", (), is_table_of_frames),
-        ("tracked", "a.glb", (), lambda found, path: moves(path)),
-        ("tracked", "a.bvh", (), lambda found, path: "Frames: 3" in path.read_text(encoding="utf-8")),
-        ("tracked", "a.gif", ("cloud0.ply", "cloud1.ply", "cloud0.ply"), lambda f, path: read_picture(path) == FRAMES),
-        ("tracked", "a.png", (), lambda found, path: read_picture(path) == PLAIN),
-        (
-            "tracked",
-            "a",
-            ("cloud0.ply", "cloud1.ply", "cloud0.ply"),
-            lambda found, path: len(list(path.iterdir())) == 3,
-        ),
-        ("spine", "a.swc", (), is_swc),
-        ("spine", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["tips"], found.tips)),
-        ("spine", "a.csv", (), lambda found, path: read_table(path)[0][:2] == ["time", "length_0"]),
-        ("spine", "a.png", (), lambda found, path: read_picture(path) == PLAIN),
-        ("spine", "a.glb", ("",), lambda found, path: moves(path)),
-        ("spine", "a.gif", ("",), lambda found, path: read_picture(path) == FRAMES),
-        ("spine", "a", ("",), lambda found, path: len(list(path.iterdir())) == 3),
-        ("scan", "a.ply", (), lambda found, path: holds(path, found.deformed) == (True, True)),
-        ("scan", "a.glb", (), lambda found, path: moves(path)),
-        ("scan", "a.png", (), lambda found, path: read_picture(path) == PLAIN),
-        ("scan", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["deformed"], found.deformed)),
-        ("size", "a.glb", (), lambda found, path: len(trimesh.load_scene(path).geometry) == 3),
-    ],
+@each_row(
+    ("aligned0", "a.json", (), is_pose),
+    ("aligned0", "a.csv", (), is_table_of_poses),
+    ("aligned0", "a.ply", (), lambda found, path: holds(path, found.registered)[0]),
+    ("aligned0", "a.glb", (), moves),
+    ("aligned0", "a.png", ("cloud0.ply",), is_drawn),
+    ("aligned0", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["pose"], found.pose)),
+    (
+        "tracked",
+        "a.json",
+        (),
+        lambda found, path: json.loads(path.read_text())["poses"]["base_x"] == found.poses[:, 0].tolist(),
+    ),
+    ("tracked", "a.csv", (), is_table_of_frames),
+    ("tracked", "a.glb", (), moves),
+    ("tracked", "a.bvh", (), lambda found, path: "Frames: 3" in path.read_text(encoding="utf-8")),
+    ("tracked", "a.gif", ("cloud0.ply", "cloud1.ply", "cloud0.ply"), lambda f, path: read_picture(path) == (3, True)),
+    ("tracked", "a.png", (), is_drawn),
+    ("tracked", "a", ("cloud0.ply", "cloud1.ply", "cloud0.ply"), lambda found, path: len(list(path.iterdir())) == 3),
+    ("spine", "a.swc", (), is_swc),
+    ("spine", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["tips"], found.tips)),
+    ("spine", "a.csv", (), lambda found, path: read_table(path)[0][:2] == ["time", "length_0"]),
+    ("spine", "a.png", (), is_drawn),
+    ("spine", "a.glb", ("",), moves),
+    ("spine", "a.gif", ("",), lambda found, path: read_picture(path) == (3, True)),
+    ("spine", "a", ("",), lambda found, path: len(list(path.iterdir())) == 3),
+    ("scan", "a.ply", (), lambda found, path: holds(path, found.deformed) == (True, True)),
+    ("scan", "a.glb", (), moves),
+    ("scan", "a.png", (), is_drawn),
+    ("scan", "a.npz", (), lambda found, path: np.array_equal(arrays(path)["deformed"], found.deformed)),
+    ("size", "a.glb", (), lambda found, path: len(trimesh.load_scene(path).geometry) == 3),
 )
-def test_every_ending_is_written(run, results, starfish, folder, tmp_path, name, file, options, check):
+def test_every_ending_is_written(done, results, starfish, folder, tmp_path, name, file, options, check):
     place = starfish if name == "spine" else folder
     data = [word for option in options for word in ("--data", place / option)]
-    answer = run("export", results / name, "-o", tmp_path / file, *data)
-    assert answer.exit_code == 0, answer.output
-    assert answer.output.endswith(f"-> {tmp_path / file}\n")
+    output = done("export", results / name, "-o", tmp_path / file, *data)
+    assert output.endswith(f"-> {tmp_path / file}\n")
     found = tr.load(results / f"{name}.safetensors")
     assert check(found, tmp_path / file)
 
@@ -164,7 +158,7 @@ def test_the_base_of_a_robot_is_written_for_ros(run, error_of, results, folder, 
     command = "export", results / "base", "-o", tmp_path / "a.json"
     assert "a.json needs what the result does not hold; pass --shape" in error_of(*command)
     assert run(*command, "--shape", folder / "arm.urdf").exit_code == 0
-    written = read_json(tmp_path / "a.json")
+    written = json.loads((tmp_path / "a.json").read_text())
     assert (written["T_camera_base"], list(written["offsets"])) == (torch.eye(4).tolist(), ["shoulder", "rail"])
     assert "--qw 1 " in written["ros2"]
 
@@ -178,23 +172,17 @@ def test_shapes_that_a_result_left_out_are_given(run, error_of, results, tmp_pat
     assert (tmp_path / "a.bvh").read_bytes() == (tmp_path / "b.bvh").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (
-            ("scan", "-o", "a.bvh"),
-            "a ScanRegistration is not written as .bvh, but as .gif, .glb, .mp4, .npz, .pdf, .ply",
-        ),
-        (("scan", "-o", "a"), "a ScanRegistration is not written as FOLDER"),
-        (("tracked", "-o", "a.gif"), "a.gif needs what the result does not hold; pass --data with what was measured"),
-        (("spine", "-o", "a.glb"), "a.glb needs what the result does not hold; pass --data"),
-        (("aligned0", "-o", "a.png"), "a.png needs what the result does not hold; pass --data"),
-        (("aligned0", "-o", "aligned0.json", "--force"), "aligned0.json is a part of the result"),
-        (("aligned0", "-o", "a.csv", "--fps", "0"), "--fps must be positive"),
-        (("scan", "-o", "a.ply", "--color", "red"), "--color must be one of bones, distance"),
-        (("nothing", "-o", "a.csv"), "nothing.safetensors: No such file"),
-        (("aligned0", "-o", "spine.json"), "spine.json exists; pass --force"),
-    ],
+@each_row(
+    (("scan", "-o", "a.bvh"), "a ScanRegistration is not written as .bvh, but as .gif, .glb, .mp4, .npz, .pdf"),
+    (("scan", "-o", "a"), "a ScanRegistration is not written as FOLDER"),
+    (("tracked", "-o", "a.gif"), "a.gif needs what the result does not hold; pass --data with what was measured"),
+    (("spine", "-o", "a.glb"), "a.glb needs what the result does not hold; pass --data"),
+    (("aligned0", "-o", "a.png"), "a.png needs what the result does not hold; pass --data"),
+    (("aligned0", "-o", "aligned0.json", "--force"), "aligned0.json is a part of the result"),
+    (("aligned0", "-o", "a.csv", "--fps", "0"), "--fps must be positive"),
+    (("scan", "-o", "a.ply", "--color", "red"), "--color must be one of bones, distance"),
+    (("nothing", "-o", "a.csv"), "nothing.safetensors: No such file"),
+    (("aligned0", "-o", "spine.json"), "spine.json exists; pass --force"),
 )
 def test_what_is_missing_is_named(error_of, results, words, message):
     before = sorted(results.iterdir())

@@ -24,17 +24,16 @@ def pair(registered, monkeypatch):
     return place / "source.ply", place / "target.ply"
 
 
-def test_a_pair_becomes_a_scene_and_a_result(run, pair, tmp_path):
+def test_a_pair_becomes_a_scene_and_a_result(run, done, pair, tmp_path):
     old = {"--weights": "bones.ply", "--errors": "distance.ply"}
     given = [word if word in old else tmp_path / word for row in old.items() for word in row]
-    answer = run("register", *pair, "-o", tmp_path / "out.glb", *SMALL, *given)
-    assert answer.exit_code == 0, answer.output
-    assert "bones" in answer.output
-    assert "refine" in answer.output
+    output = done("register", *pair, "-o", tmp_path / "out.glb", *SMALL, *given)
+    assert "bones" in output
+    assert "refine" in output
     found = tr.load(tmp_path / "out.safetensors")
     assert 1 < found.model.num_bones <= 6
     for option, name in old.items():
-        assert answer.output.count(f"{option} goes with the next release") == 1
+        assert output.count(f"{option} goes with the next release") == 1
         run("export", tmp_path / "out", "-o", tmp_path / "e.ply", "--color", name[:-4], "--force")
         assert (tmp_path / "e.ply").read_bytes() == (tmp_path / name).read_bytes()
         torch.testing.assert_close(tr.load_points(tmp_path / name).points, found.deformed, atol=1e-5, rtol=0)
@@ -111,7 +110,7 @@ def test_depth_images_are_registered_and_what_was_seen_is_drawn(run, error_of, t
     assert "0.png: depth" in error_of(*pair, *far, *out, "--seen", tmp_path / "far")
 
 
-def test_scans_of_a_robot_become_its_description(run, error_of, registered, tmp_path, monkeypatch):
+def test_scans_of_a_robot_become_its_description(done, error_of, registered, tmp_path, monkeypatch):
     three = ("register", *(registered[0] / f"{name}.ply" for name in ("source", "target", "bare")))
     kinds = [SimpleNamespace(name="joint_1", kind="revolute")]
     robot = SimpleNamespace(
@@ -135,11 +134,10 @@ def test_scans_of_a_robot_become_its_description(run, error_of, registered, tmp_
         return Found()
 
     monkeypatch.setattr("torchreg.registration.register_sequence.register_sequence", known)
-    answer = run(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
-    assert answer.exit_code == 0, answer.output
+    output = done(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
     assert asked == [(3, 8, 25), tmp_path / "robot.safetensors", tmp_path / "robot.urdf"]
-    assert "converged, confidence 70% in the worst scan: 2 links, 1 hinges and 0 sliders" in answer.output
-    assert "joint_1 does not explain how its two links move" in answer.output
+    assert "converged, confidence 70% in the worst scan: 2 links, 1 hinges and 0 sliders" in output
+    assert "joint_1 does not explain how its two links move" in output
     lines = (tmp_path / "robot_joints.csv").read_text().splitlines()
     assert lines == ["scan,joint_1", "source.ply,0.0", "target.ply,0.25", "bare.ply,-0.5"]
     for options, message in [
@@ -158,16 +156,15 @@ def _text(place, mark):
     return mark.join(str(number) for number in place.tolist())
 
 
-def test_handles_come_to_their_targets(run, error_of, registered, tmp_path):
+def test_handles_come_to_their_targets(done, error_of, registered, tmp_path):
     place, found, _ = registered
     ends = [int(found.points[:, 1].argmin()), int(found.points[:, 1].argmax())]
     targets = found.deformed[ends] + 0.01
     options = []
     for end, target in zip(ends, targets, strict=True):
         options += ["--handle", _text(found.points[end], ","), "--to", _text(target, " ")]
-    answer = run("pose", place / "found", *options, "-o", tmp_path / "posed.ply")
-    assert answer.exit_code == 0, answer.output
-    assert "miss" in answer.output
+    output = done("pose", place / "found", *options, "-o", tmp_path / "posed.ply")
+    assert "miss" in output
     posed = tr.load_points(tmp_path / "posed.ply").points
     assert float((posed[ends] - targets).norm(dim=-1).max()) < 0.005
     tr.PoseStarts(torch.zeros(1, 6), torch.zeros(1), torch.tensor(1.0)).save(tmp_path / "starts.safetensors")
@@ -181,13 +178,12 @@ def test_handles_come_to_their_targets(run, error_of, registered, tmp_path):
         assert message in error_of("pose", "-o", tmp_path / "no.ply", *words)
 
 
-def test_without_handles_a_page_opens(run, error_of, registered, tmp_path, interrupted):
+def test_without_handles_a_page_opens(done, error_of, registered, tmp_path, interrupted):
     pytest.importorskip("viser", reason="the viewer needs viser")
     place, found, _ = registered
     interrupted("torchreg.cli.view.time.sleep")
     tr.solve_pose(found.model, found.points[:1], found.deformed[:1] + 0.05).save(tmp_path / "start.safetensors")
     page = "--no-browser", "--port", "0", "-o", tmp_path / "p.ply"
-    answer = run("pose", place / "found", "--start", tmp_path / "start", *page)
-    assert answer.exit_code == 0, answer.output
-    assert "http://127.0.0.1:" in answer.output
+    output = done("pose", place / "found", "--start", tmp_path / "start", *page)
+    assert "http://127.0.0.1:" in output
     assert "a pose to start from" in error_of("pose", place / "found", "--start", place / "found", *page)

@@ -17,18 +17,16 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_a_folder_becomes_a_rig_with_a_clip(run, folder, tmp_path):
-    answer = run("rig", folder, "-o", tmp_path / "arm.glb", "--template", 0, "--bones", 4, "--up", "y")
-    assert answer.exit_code == 0, answer.output
-    assert "in the mesh of frame 0; 3 of 3 frames" in answer.output
+def test_a_folder_becomes_a_rig_with_a_clip(done, folder, tmp_path):
+    output = done("rig", folder, "-o", tmp_path / "arm.glb", "--template", 0, "--bones", 4, "--up", "y")
+    assert "in the mesh of frame 0; 3 of 3 frames" in output
     found = tr.load(tmp_path / "arm.safetensors")
     assert tr.ArticulatedShape.from_gltf(tmp_path / "arm.glb").num_parts == len(found.joints)
     for name in ("again.glb", "arm.bvh"):
-        assert run("export", tmp_path / "arm", "-o", tmp_path / name).exit_code == 0
+        done("export", tmp_path / "arm", "-o", tmp_path / name)
         assert (tmp_path / name).stat().st_size > 500
     assert (tmp_path / "again.glb").read_bytes() == (tmp_path / "arm.glb").read_bytes()
-    answer = run("view", tmp_path / "arm.safetensors", "--html", tmp_path / "arm.html")
-    assert answer.exit_code == 0, answer.output
+    done("view", tmp_path / "arm.safetensors", "--html", tmp_path / "arm.html")
 
 
 def test_what_cannot_be_rigged_is_refused_in_one_line(error_of, folder, tmp_path):

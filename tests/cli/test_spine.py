@@ -9,6 +9,8 @@ import torch
 import torchreg as tr
 from experiments.made_up.pictures import camera_ring
 from tests.cli.conftest import depth_of, save_cameras, save_picture
+from tests.tables import each_row
+from torchreg.cli.writers import Source
 from torchreg.io.points import save_points
 
 SMALL = ("--tips", 5, "--samples", 12, "--workers", 1)
@@ -28,16 +30,15 @@ def masks(starfish, tmp_path_factory):
     return [place / name for name in ring.names], place / "calib.json"
 
 
-def test_old_options_write_as_export_does_and_are_warned_of_once(run, starfish, tmp_path):
+def test_old_options_write_as_export_does_and_are_warned_of_once(run, done, starfish, tmp_path):
     given = [word if word in OLD else tmp_path / word for pair in OLD.items() for word in pair]
-    answer = run("spine", starfish, "-o", tmp_path / "a.glb", *given, "--pictures", tmp_path / "a", "--workers", 1)
-    assert answer.exit_code == 0, answer.output
-    assert "5 tips, 1 junction, 5 limbs; 3 of 3 frames" in answer.output
+    output = done("spine", starfish, "-o", tmp_path / "a.glb", *given, "--pictures", tmp_path / "a", "--workers", 1)
+    assert "5 tips, 1 junction, 5 limbs; 3 of 3 frames" in output
     assert tr.load(tmp_path / "a.safetensors").num_tips == 5
     (tmp_path / "new").mkdir()
     for option, name in {**OLD, "--pictures": "a", "-o": "a.glb"}.items():
         measured = ["--data", starfish] if name in ("a.gif", "a", "a.glb") else []
-        assert answer.output.count(f"{option} goes with the next release") == (option != "-o")
+        assert output.count(f"{option} goes with the next release") == (option != "-o")
         run("export", tmp_path / "a", *measured, "-o", tmp_path / "new" / name)
     written = [path for path in sorted((tmp_path / "new").rglob("*")) if path.is_file()]
     assert len(written) == 3 + 4 + 3 + 1
@@ -85,33 +86,29 @@ def test_files_are_put_in_order_and_work_goes_on(run, starfish, tmp_path):
     assert len(list((tmp_path / "kept").glob("*.safetensors"))) == 3
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["x.npz"], "x.npz: No such file"),
-        (["--swc", "a.txt"], "must end in .swc"),
-        (["--movie", "a.txt"], "must end in .gif, .mp4"),
-        (["--tips", 9], "num_tips must be what a frame shows"),
-        (["--fps", 0], "--fps must be positive"),
-        (["--support", "cut"], "auto, keep"),
-        (["--growing", "--tips", 5], "--growing cannot be used with --tips"),
-        (["--growing", "--prior", "a.swc"], "--growing cannot be used with --prior"),
-        (["--resolution", 64], "--resolution has no meaning without --silhouettes"),
-        (["--silhouettes"], "--silhouettes takes --calibration"),
-        (["-o", "frame2.ply/a.glb"], "frame2.ply does not exist; create it first"),
-    ],
+@each_row(
+    (["x.npz"], "x.npz: No such file"),
+    (["--swc", "a.txt"], "must end in .swc"),
+    (["--movie", "a.txt"], "must end in .gif, .mp4"),
+    (["--tips", 9], "num_tips must be what a frame shows"),
+    (["--fps", 0], "--fps must be positive"),
+    (["--support", "cut"], "auto, keep"),
+    (["--growing", "--tips", 5], "--growing cannot be used with --tips"),
+    (["--growing", "--prior", "a.swc"], "--growing cannot be used with --prior"),
+    (["--resolution", 64], "--resolution has no meaning without --silhouettes"),
+    (["--silhouettes"], "--silhouettes takes --calibration"),
+    (["-o", "frame2.ply/a.glb"], "frame2.ply does not exist; create it first"),
 )
 def test_errors_take_one_line(error_of, starfish, tmp_path, options, message):
     given = [tmp_path / word if "." in str(word) else word for word in options]
     assert message in error_of("spine", starfish, "-o", tmp_path / "a.glb", *given)
 
 
-def test_masks_of_several_cameras_become_a_spine(run, error_of, masks, tmp_path):
+def test_masks_of_several_cameras_become_a_spine(run, done, error_of, masks, tmp_path):
     folders, calibration = masks
     command = ("spine", "--silhouettes", *folders, "--calibration", calibration, "--resolution", 48)
-    answer = run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept")
-    assert answer.exit_code == 0, answer.output
-    assert "5 tips, 1 junction, 5 limbs" in answer.output
+    output = done(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept")
+    assert "5 tips, 1 junction, 5 limbs" in output
     whole = tr.load(tmp_path / "s.safetensors")
     assert [path.name for path in (tmp_path / "s_seen").iterdir()] == ["hull_0000.png"]
     assert run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept", "--force").exit_code == 0
@@ -137,18 +134,13 @@ def test_a_prior_gives_the_names(run, error_of, starfish, tmp_path):
         assert "--prior must be a spine (.safetensors) or a skeleton (.swc)" in message
 
 
-def test_tips_that_may_grow(run, starfish, tmp_path):
-    answer = run("spine", starfish, "-o", tmp_path / "a.glb", "--growing", "--quiet", "--workers", 1)
-    assert answer.exit_code == 0, answer.output
+def test_tips_that_may_grow(done, starfish, tmp_path):
+    done("spine", starfish, "-o", tmp_path / "a.glb", "--growing", "--quiet", "--workers", 1)
     assert tr.load(tmp_path / "a.safetensors").births.tolist() == [0] * 5
 
 
-@pytest.mark.parametrize("origin", [None, (4.0e5, -5.0e6, 30.0)])
-def test_mesh_of_a_picture_begins_at_the_origin(origin):
-    from torchreg.cli.writers import Source
-
-    near = tr.TriangleMesh(torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
-    origin = None if origin is None else torch.tensor(origin, dtype=torch.float64)
-    far = tr.TriangleMesh(near.vertices + (0.0 if origin is None else origin), near.faces)
-    mesh = Source([SimpleNamespace(origin=origin)]).about_origin(far)
-    torch.testing.assert_close(mesh.vertices, near.vertices, atol=1e-8, rtol=0.0)
+def test_mesh_of_a_picture_begins_at_the_origin():
+    near, origin = torch.eye(3, dtype=torch.float64), torch.tensor([4.0e5, -5.0e6, 30.0], dtype=torch.float64)
+    for begin, vertices in ((None, near), (origin, near + origin)):
+        mesh = Source([SimpleNamespace(origin=begin)]).about_origin(tr.TriangleMesh(vertices, [[0, 1, 2]]))
+        torch.testing.assert_close(mesh.vertices, near, atol=1e-8, rtol=0.0)

@@ -46,10 +46,9 @@ def stereo(pair, tmp_path):
     )  # fmt: skip
 
 
-def test_pictures_are_tracked_and_what_was_seen_is_drawn(run, error_of, stereo, pair, plain_hand, tmp_path):
-    answer = run(*stereo())
-    assert answer.exit_code == 0, answer.output
-    assert "2 frames: 2 tracked" in answer.output
+def test_pictures_are_tracked_and_what_was_seen_is_drawn(done, error_of, stereo, pair, plain_hand, tmp_path):
+    output = done(*stereo())
+    assert "2 frames: 2 tracked" in output
     result = tr.load(tmp_path / "r.safetensors")
     assert (result.keypoints - plain_hand.keypoints(pair[1])).norm(dim=-1).mean() < 5e-3
     names = sorted(path.name for path in (tmp_path / "r_seen").iterdir())

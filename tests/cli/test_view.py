@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.tables import each_row
 from torchreg.io.points import save_points
 
 pytest.importorskip("viser", reason="the viewer needs viser")
@@ -20,57 +21,39 @@ def result(tmp_path_factory):
     return place
 
 
-def test_a_result_becomes_one_file(run, result, tmp_path):
-    answer = run(
+def test_a_result_becomes_one_file(done, result, tmp_path):
+    output = done(
         "view", result / "starts", "--shape", "hand", "--data", result / "cloud.ply", "--html", tmp_path / "a.html"
     )
-    assert answer.exit_code == 0, answer.output
-    assert "poses found" in answer.output
+    assert "poses found" in output
     assert (tmp_path / "a.html").stat().st_size > 100_000
 
 
-def test_a_result_is_served_until_interrupted(run, result, monkeypatch, interrupted):
+def test_a_result_is_served_until_interrupted(done, result, monkeypatch, interrupted):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     interrupted("torchreg.cli.view.time.sleep")
-    answer = run("view", result / "starts", "--shape", "hand", "--port", "0", "--up", "-y")
-    assert answer.exit_code == 0, answer.output
-    assert opened[0] in answer.output
+    output = done("view", result / "starts", "--shape", "hand", "--port", "0", "--up", "-y")
+    assert opened[0] in output
     assert opened[0].startswith("http://127.0.0.1:")
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["starts", "--html", "a.html"], "shape must be given"),
-        (["starts", "--up", "w"], "--up must be one of"),
-        (["starts", "--html", "a.txt"], "must end in"),
-        (["starts", "--fixed-base"], "about a --shape"),
-        (["nowhere", "--shape", "hand"], "nowhere"),
-    ],
-)
+@each_row(
+    (["starts", "--html", "a.html"], "shape must be given"), (["starts", "--up", "w"], "--up must be one of"),
+    (["starts", "--html", "a.txt"], "must end in"), (["starts", "--fixed-base"], "about a --shape"),
+    (["nowhere", "--shape", "hand"], "nowhere"),
+)  # fmt: skip
 def test_what_does_not_fit_is_refused(error_of, result, tmp_path, words, message):
     given = [tmp_path / word if "." in word else word for word in words[1:]]
     assert message in error_of("view", result / words[0], *given)
 
 
-def test_shapes_and_scans_are_viewed_too(run, error_of, result, folder, tmp_path):
-    for number, (name, told) in enumerate(
-        [
-            ("hand", "16 parts, 27 degrees of freedom"),
-            (folder / "arm.urdf", "degrees of freedom"),
-            (result / "cloud.ply", "21 points"),
-            (result / "mesh.ply", "3 points, 1 triangle"),
-        ]
-    ):
-        answer = run("view", name, "--html", tmp_path / f"{number}.html")
-        assert answer.exit_code == 0, answer.output
-        assert told in answer.output
-    assert "did you mean 'hand'?" in error_of("view", "hands", "--html", tmp_path / "x.html")
-
-
-def test_results_are_shown_with_the_shape_that_they_keep(run, result, tmp_path):
+def test_shapes_and_scans_are_viewed_too(done, error_of, result, folder, tmp_path):
     rest = tr.Hand().rest_pose()
     tr.PoseStarts(rest[None], torch.zeros(1), torch.tensor(1.0), tr.Hand()).save(tmp_path / "s.safetensors")
-    answer = run("view", tmp_path / "s", "--html", tmp_path / "s.html")
-    assert answer.exit_code == 0, answer.output
+    for name, shown in (
+        ("hand", "16 parts, 27 degrees of freedom"), (folder / "arm.urdf", "degrees of freedom"),
+        (result / "cloud.ply", "21 points"), (result / "mesh.ply", "3 points, 1 triangle"), (tmp_path / "s", "poses"),
+    ):  # fmt: skip
+        assert shown in done("view", name, "--html", tmp_path / "shown.html", "--force")
+    assert "did you mean 'hand'?" in error_of("view", "hands", "--html", tmp_path / "x.html")

@@ -6,13 +6,11 @@ import struct
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 import torchreg as tr
+from tests.gltf_player import KINDS, TYPES
 
-KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 9: "MAT3", 16: "MAT4"}
 TURN = [0, 0, -np.sqrt(0.5), np.sqrt(0.5)]  # a quarter turn about z, clockwise
 
 
@@ -26,13 +24,6 @@ def put(folder, name, content):
 def read(folder, name, content, **options):
     """Write a file and return its cloud in double precision."""
     return tr.load_points(put(folder, name, content), **{"dtype": torch.float64, **options})
-
-
-def refused(*rows, error=tr.errors.FormatError):
-    """Make each (call, words) of a table raise."""
-    for call, words in rows:
-        with pytest.raises(error, match=words):
-            call()
 
 
 def bar(height=2.0, thick=0.3, rings=9, unit=1.0):

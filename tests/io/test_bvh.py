@@ -7,10 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import torchreg as tr
 from torchreg.datasets.hand import hand_motion
-from torchreg.errors import InputError
 from torchreg.io.bvh import save_bvh
-from torchreg.result import Status
-from torchreg.tracking.results import TrackResult
 from torchreg.viz.track_bvh import save_track_bvh
 
 
@@ -60,9 +57,9 @@ def read(path):
 
 def track(shape, poses, seconds=0.05):
     count = len(poses)
-    return TrackResult(
+    return tr.TrackResult(
         poses, torch.zeros_like(poses), shape.keypoints(poses.nan_to_num()), torch.ones(count), torch.ones(count),
-        seconds * torch.arange(count), torch.ones(count), (Status.CONVERGED,) * count, ("tracked",) * count,
+        seconds * torch.arange(count), torch.ones(count), (tr.Status.CONVERGED,) * count, ("tracked",) * count,
     )  # fmt: skip
 
 
@@ -86,7 +83,7 @@ def test_a_pose_that_is_not_known_is_held(tmp_path):
     places = read(save_track_bvh(tmp_path / "a.bvh", hand, track(hand, poses)))[1]
     np.testing.assert_array_equal(places[0], places[1])
     np.testing.assert_array_equal(places[2], places[1])
-    with pytest.raises(InputError, match="the shape was never found"):
+    with pytest.raises(tr.errors.InputError, match="the shape was never found"):
         save_track_bvh(tmp_path / "b.bvh", hand, track(hand, torch.full_like(poses, torch.nan)))
 
 
@@ -130,10 +127,10 @@ def test_what_the_format_cannot_hold_is_refused(tmp_path):
     (tmp_path / "r.urdf").write_text(sides("prismatic"), encoding="utf-8")
     shape = tr.ArticulatedShape.from_urdf(tmp_path / "r.urdf")
     poses = torch.stack((shape.rest_pose(), shape.pose_from_dict({"left": 0.5})))
-    with pytest.raises(InputError, match=r"'left_arm' slides by 0.5 in its parent; write \.glb"):
+    with pytest.raises(tr.errors.InputError, match=r"'left_arm' slides by 0.5 in its parent; write \.glb"):
         save_track_bvh(tmp_path / "a.bvh", shape, track(shape, poses))
     still = torch.eye(4).repeat(2, 1, 1)
-    with pytest.raises(InputError, match=r"path must end in \.bvh"):
+    with pytest.raises(tr.errors.InputError, match=r"path must end in \.bvh"):
         save_bvh(tmp_path / "a.txt", ["a", "b"], [-1, 0], still, still[None], 20.0)
-    with pytest.raises(InputError, match="parents must make one tree of 2 joints"):
+    with pytest.raises(tr.errors.InputError, match="parents must make one tree of 2 joints"):
         save_bvh(tmp_path / "a.bvh", ["a", "b"], [-1, -1], still, still[None], 20.0)

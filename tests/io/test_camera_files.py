@@ -7,10 +7,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
+from tests.tables import each_row, refused, refusing
 from torchreg.io.calibration import load_depth_camera, save_cameras, save_depth_camera
 from torchreg.io.cameras.colmap import save_colmap
-from torchreg.io.cameras.opencv_yaml import load_opencv, save_opencv
+from torchreg.io.cameras.opencv_yaml import save_opencv
 from torchreg.io.limits import FileLimits
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
@@ -83,33 +84,20 @@ def several(*cameras, **entries):
     return {"format": "torchreg-cameras", "version": 1, "cameras": list(cameras)} | entries
 
 
-@pytest.mark.parametrize(
-    ("document", "message"),
-    [
-        ('{"width": 640, "hei', "cut off or no JSON"),
-        ("[1]", "must hold a JSON object, got list"),
-        ('{"width": NaN}', "numbers must be finite, got NaN"),
-        (PLAIN | {"fx": 1e999}, "must be finite"),
-        ({"width": 1, "height": 1, "fx": 1}, "lacks fy, cx, cy"),
-        (PLAIN | {"distortions": [0]}, "holds distortions, which no camera has; is it distortion"),
-        (PLAIN | {"fx": "wide"}, "fx must hold numbers"),
-        (PLAIN | {"width": 640.5}, "width must be an integer"),
-        (PLAIN | {"width": 64_000, "height": 1001}, "at most 64 megapixels"),
-        (PLAIN | {"name": 3}, "name must be text"),
-        (PLAIN | {"distortion": [1.0]}, "0, 4, 5 or 8 numbers"),
-        (PLAIN | {"world_to_camera": [[1, 0], [0]]}, "all rows equally many"),
-        (PLAIN | {"camera_to_world": [[1, 0], [0, 1]]}, r"camera_to_world must have shape \(4, 4\)"),
-        (PLAIN | {"camera_to_world": [], "world_to_camera": []}, "keep one"),
-        ({"cameras": [PLAIN]}, 'must hold "format"'),
-        (several(), "list of at least one"),
-        (several(3), "camera 0 must be a JSON object"),
-        (several(*[PLAIN | {"name": "a"}] * 2), "a more than once"),
-    ],
+test_damaged_cameras = refusing(lambda folder, content: tr.load_cameras(put(folder, "c.json", content)), file="c.json")(
+    ('{"width": 640, "hei', "cut off or no JSON"),
+    ('{"width": NaN}', "numbers must be finite, got NaN"),
+    ({"width": 1, "height": 1, "fx": 1}, "lacks fy, cx, cy"),
+    (PLAIN | {"fx": "wide"}, "fx must hold numbers"),
+    (PLAIN | {"width": 640.5}, "width must be an integer"),
+    (PLAIN | {"width": 64_000, "height": 1001}, "at most 64 megapixels"),
+    (PLAIN | {"distortion": [1.0]}, "0, 4, 5 or 8 numbers"),
+    (PLAIN | {"camera_to_world": [[1, 0], [0, 1]]}, r"camera_to_world must have shape \(4, 4\)"),
+    (PLAIN | {"camera_to_world": [], "world_to_camera": []}, "keep one"),
+    ({"cameras": [PLAIN]}, 'must hold "format"'),
+    (several(), "list of at least one"),
+    (several(*[PLAIN | {"name": "a"}] * 2), "a more than once"),
 )
-def test_what_is_wrong_with_a_file_is_said_and_the_file_named(tmp_path, document, message):
-    text = document if isinstance(document, str) else json.dumps(document).replace("Infinity", "1e999")
-    with pytest.raises(FormatError, match=rf"(?s)c\.json.*{message}"):
-        tr.load_cameras(put(tmp_path, "c.json", text))
 
 
 @pytest.mark.parametrize("name", [*PLAIN, "depth_scale"])
@@ -141,59 +129,40 @@ HALF = 0.5**0.5
 IMAGES = f"# a comment\n1 {HALF} 0 0 {HALF} 0.1 0.2 0.3 7 a.png\n10 20 -1 30 40 5\n2 1 0 0 0 0 0 1 7 b c.png\n"
 
 
-@pytest.fixture
-def model(tmp_path):
-    def write(cameras=CAMERA, images=IMAGES):
-        put(tmp_path, "cameras.txt", cameras)
-        put(tmp_path, "images.txt", images)
-        return tmp_path
-
-    return write
+def colmap(folder, cameras=CAMERA, images=IMAGES):
+    put(folder, "cameras.txt", cameras)
+    return put(folder, "images.txt", images).parent
 
 
-@pytest.mark.parametrize(
-    ("line", "values"),
-    [
-        (CAMERA, [600, 601, 319.5, 239.5, 0.1, 0.2, 0.001, 0.002]),
-        ("7 SIMPLE_PINHOLE 640 480 600 320 240", [600, 600, 319.5, 239.5, 0, 0, 0, 0]),
-        ("7 PINHOLE 640 480 600 601 320 240", [600, 601, 319.5, 239.5, 0, 0, 0, 0]),
-        ("7 SIMPLE_RADIAL 640 480 600 320 240 0.1", [600, 600, 319.5, 239.5, 0.1, 0, 0, 0]),
-        ("7 RADIAL 640 480 600 320 240 0.1 0.2", [600, 600, 319.5, 239.5, 0.1, 0.2, 0, 0]),
-        ("7 FULL_OPENCV 640 480 600 601 320 240 1 2 3 4 5 6 7 8", [600, 601, 319.5, 239.5, 1, 2, 3, 4]),
-    ],
+@each_row(
+    (CAMERA, [600, 601, 319.5, 239.5, 0.1, 0.2, 0.001, 0.002]),
+    ("7 SIMPLE_PINHOLE 640 480 600 320 240", [600, 600, 319.5, 239.5, 0, 0, 0, 0]),
+    ("7 PINHOLE 640 480 600 601 320 240", [600, 601, 319.5, 239.5, 0, 0, 0, 0]),
+    ("7 SIMPLE_RADIAL 640 480 600 320 240 0.1", [600, 600, 319.5, 239.5, 0.1, 0, 0, 0]),
+    ("7 RADIAL 640 480 600 320 240 0.1 0.2", [600, 600, 319.5, 239.5, 0.1, 0.2, 0, 0]),
+    ("7 FULL_OPENCV 640 480 600 601 320 240 1 2 3 4 5 6 7 8", [600, 601, 319.5, 239.5, 1, 2, 3, 4]),
 )
-def test_models_of_colmap_become_cameras_in_our_convention(model, line, values):
-    cameras = tr.load_cameras(model(line + "\n"))
+def test_models_of_colmap_become_cameras_in_our_convention(tmp_path, line, values):
+    cameras = tr.load_cameras(colmap(tmp_path, line + "\n"))
     assert cameras.names == ("a.png", "b c.png")
     assert [*cameras[0].intrinsics.tolist(), *cameras[0].distortion[:4].tolist()] == values
     turned = cameras[0].world_to_camera @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     assert torch.allclose(turned, turned.new_tensor([0.1, 1.2, 0.3, 1.0]))
 
 
-@pytest.mark.parametrize(
-    ("cameras", "images", "message"),
-    [
-        ("7 OPENCV 640 480 600 601 320 240 0.1\n", IMAGES, "line 1: OPENCV has 8 parameters, got 5: it is cut off"),
-        ("7 OPENCV 640\n", IMAGES, "must be CAMERA_ID MODEL"),
-        ("7 PINHOLE \u00b2 4 1 1 1 1\n", IMAGES, "must be CAMERA_ID"),
-        (f"7 PINHOLE {'9' * 5000} 4 1 1 1 1\n", IMAGES, "must be CAMERA_ID"),
-        ("7 FISHEYE 640 480 1\n", IMAGES, "lenses must be one of SIMPLE_PINHOLE, .*; got FISHEYE"),
-        ("7 PINHOLE 640 480 nan 601 320 240\n", IMAGES, "must be finite"),
-        ("7 PINHOLE 640 480 x 601 320 240\n", IMAGES, "must hold numbers"),
-        ("7 PINHOLE 64000 48000 600 601 320 240\n", IMAGES, "64 megapixels"),
-        (CAMERA + CAMERA, IMAGES, "camera 7 is listed twice"),
-        (CAMERA, "1 1 0 0 0 0.1 0.2\n", "line 1: must be IMAGE_ID QW"),
-        (CAMERA, "1 2 0 0 0 0 0 0 7 a\n", "unit quaternion, got length 2"),
-        (CAMERA, "1 1 0 0 0 0 0 inf 7 a\n", "must be finite"),
-        (CAMERA, "1 1 0 0 0 0 0 0 8 a\n", "names camera 8, cameras.txt holds 7"),
-        (CAMERA, "1 1 0 0 0 0 0 0 7 a\n\n2 1 0 0 0 0 0 0 7 a\n", "a more than once"),
-        (CAMERA, "# nothing\n", "at least one camera"),
-        (CAMERA, b"\x80\x81\x00\xff", "is no text"),
-    ],
+test_damaged_colmap = refusing(lambda folder, *texts: tr.load_cameras(colmap(folder, *texts)))(
+    ("7 OPENCV 640 480 600 601 320 240 0.1\n", IMAGES, "line 1: OPENCV has 8 parameters, got 5: it is cut off"),
+    (f"7 PINHOLE {'9' * 5000} 4 1 1 1 1\n", IMAGES, "must be CAMERA_ID"),
+    ("7 FISHEYE 640 480 1\n", IMAGES, "lenses must be one of SIMPLE_PINHOLE, .*; got FISHEYE"),
+    ("7 PINHOLE 640 480 nan 601 320 240\n", IMAGES, "must be finite"),
+    ("7 PINHOLE 64000 48000 600 601 320 240\n", IMAGES, "64 megapixels"),
+    (CAMERA + CAMERA, IMAGES, "camera 7 is listed twice"),
+    (CAMERA, "1 1 0 0 0 0.1 0.2\n", "line 1: must be IMAGE_ID QW"),
+    (CAMERA, "1 2 0 0 0 0 0 0 7 a\n", "unit quaternion, got length 2"),
+    (CAMERA, "1 1 0 0 0 0 0 0 8 a\n", "names camera 8, cameras.txt holds 7"),
+    (CAMERA, "1 1 0 0 0 0 0 0 7 a\n\n2 1 0 0 0 0 0 0 7 a\n", "a more than once"),
+    (CAMERA, b"\x80\x81\x00\xff", "is no text"),
 )
-def test_damaged_models_of_colmap_are_refused(model, cameras, images, message):
-    with pytest.raises(FormatError, match=message):
-        tr.load_cameras(model(cameras, images))
 
 
 HEAD = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
@@ -220,13 +189,14 @@ def test_cameras_as_opencv_writes_them(tmp_path):
     (found,) = tr.load_cameras(put(tmp_path, "v.yml", text + matrix("T", 1, 3, "1, 2, 3")))
     assert torch.allclose(found.world_to_camera, motion([0.1, 0.2, 0.3], [1.0, 2.0, 3.0]))
     assert (found.width, found.height) == (640, 480)
-    path = put(tmp_path, "p.yml", "%YAML:1.0\n---\n" + PAIR + matrix("T", 3, 1, "-120, 0, 0"))
-    pair = load_opencv(path, size=(640, 480), unit=1e-3)
+    step = PAIR + matrix("T", 3, 1, "-120, 0, 0")
+    pair = tr.load_cameras(put(tmp_path, "p.yml", HEAD + step), scale=1e-3)
     assert pair.names == ("left", "right")
     assert pair.stereo().baseline == pytest.approx(0.12)
     assert pair.stereo().is_rectified
-    refused((lambda: load_opencv(path), "write them into the file, as in `image_width: 640`"))
-    refused((lambda: load_opencv(path, unit=0.0), "unit must be positive"), error=InputError)
+    path = put(tmp_path, "q.yml", "%YAML:1.0\n---\n" + step)
+    refused((lambda: tr.load_cameras(path), "write them into the file, as in `image_width: 640`"))
+    refused((lambda: tr.load_cameras(path, scale=0.0), "scale must be positive"), error=InputError)
 
 
 def test_opencv_reads_what_we_write_and_we_what_it_writes(tmp_path):
@@ -247,31 +217,21 @@ def test_opencv_reads_what_we_write_and_we_what_it_writes(tmp_path):
     assert torch.allclose(found.distortion, camera.distortion, rtol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("<opencv_storage>", "must begin with %YAML"),
-        (HEAD, "holds neither camera_matrix nor M1"),
-        (HEAD.replace("640", "64000").replace("480", "48000") + LENS, "at most 64 megapixels"),
-        (HEAD + LENS[:-20], "no closing bracket: the file is cut off"),
-        (HEAD + LENS[:40], "lacks rows, cols or data"),
-        (HEAD + matrix("camera_matrix", 3, 3, "1, 2, 3"), "must hold 3 x 3 numbers, got 3"),
-        (HEAD + matrix("camera_matrix", 1, 3, "1, 2, 3"), "must be a 3 x 3 matrix"),
-        (HEAD + matrix("camera_matrix", 3, 3, K.replace("320", ".Nan")), "must be finite"),
-        (HEAD + matrix("camera_matrix", 3, 3, K.replace("320", "x")), "must hold numbers"),
-        (HEAD + matrix("camera_matrix", 3, 3, K.replace("600", "-600")), "must be positive"),
-        (HEAD + matrix("camera_matrix", 3, 3, "600, 1, 320, 0, 600, 240, 0, 0, 1"), "must be fx 0 cx"),
-        (HEAD + LENS + matrix("distortion_coefficients", 1, 3, "1, 2, 3"), "4, 5 or 8 numbers"),
-        (HEAD + PAIR.split("R:", maxsplit=1)[0], "lacks R and T of the stereo pair"),
-        (HEAD + PAIR, "R must be a 3 x 3 matrix or a rotation vector"),
-        (HEAD + PAIR + matrix("T", 3, 1, "0.12, 0, 0"), r"swapped: the right camera stands 0\.12 to the left"),
-        *(("%YAML:1.0\n---\n" + body, "") for body in (
-            "", "no entries", "camera_matrix: !!opencv-matrix\nx", ONE.replace("rows: 1", "rows: \u0663"),
-            ONE.replace("rows: 1", "rows: " + "9" * 5000), "image_width: \u00b2\nimage_height: 3",
-            "image_width: " + "9" * 5000,
-        )),
-    ],
+test_damaged_opencv = refusing(lambda folder, text: tr.load_cameras(put(folder, "c.yml", text)), file="c.yml")(
+    ("<opencv_storage>", "must begin with %YAML"),
+    (HEAD, "holds neither camera_matrix nor M1"),
+    (HEAD.replace("640", "64000").replace("480", "48000") + LENS, "at most 64 megapixels"),
+    (HEAD + LENS[:-20], "no closing bracket: the file is cut off"),
+    (HEAD + matrix("camera_matrix", 3, 3, "1, 2, 3"), "must hold 3 x 3 numbers, got 3"),
+    (HEAD + matrix("camera_matrix", 3, 3, K.replace("320", ".Nan")), "must be finite"),
+    (HEAD + matrix("camera_matrix", 3, 3, K.replace("600", "-600")), "must be positive"),
+    (HEAD + LENS + matrix("distortion_coefficients", 1, 3, "1, 2, 3"), "4, 5 or 8 numbers"),
+    (HEAD + PAIR.split("R:", maxsplit=1)[0], "lacks R and T of the stereo pair"),
+    (HEAD + PAIR, "R must be a 3 x 3 matrix or a rotation vector"),
+    (HEAD + PAIR + matrix("T", 3, 1, "0.12, 0, 0"), r"swapped: the right camera stands 0\.12 to the left"),
+    *(("%YAML:1.0\n---\n" + body, "") for body in (
+        "", "no entries", "camera_matrix: !!opencv-matrix\nx", ONE.replace("rows: 1", "rows: \u0663"),
+        ONE.replace("rows: 1", "rows: " + "9" * 5000), "image_width: \u00b2\nimage_height: 3",
+        "image_width: " + "9" * 5000,
+    )),
 )  # fmt: skip
-def test_damaged_files_of_opencv_are_refused(tmp_path, text, message):
-    with pytest.raises(FormatError, match=rf"(?s)c\.yml.*{message}"):
-        load_opencv(put(tmp_path, "c.yml", text))

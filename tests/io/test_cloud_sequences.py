@@ -5,16 +5,14 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
 from tests.io.test_array_files import header
+from tests.tables import each, refused, refusing
 from torchreg.io.frames import save_frames
 from torchreg.io.images import list_frames, list_pictures
 from torchreg.io.limits import FileLimits
-from torchreg.io.natural_order import natural_sorted
 from torchreg.io.points import save_points
 
 FormatError, InputError = tr.errors.FormatError, tr.errors.InputError
@@ -106,44 +104,23 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     assert [path.name for path in first] == ["t=5e-2.png", "t=0.05.png"]
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from(["a", "b", "run3/"]), st.integers(0, 10**20)), min_size=1))
-def test_natural_order_sorts_by_text_then_number(pairs):
-    names = [f"{text}{number}.ply" for text, number in pairs]
-    # Of the texts, "run3/" is last and so no digit of it meets another's number.
-    assert natural_sorted(names) == [f"{text}{number}.ply" for text, number in sorted(pairs)]
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ["frame_0.5.xyz", "frame_1.0.xyz", "frame_1.25.xyz", "frame_1.5.xyz", "frame_10.0.xyz"],
-        ["t=0.05.png", "t=0.1.png", "t=0.25.png", "t=0.3.png"],
-        ["t=-2.ply", "t=-0.5.ply", "t=0.ply", "t=1.ply"],
-        ["scan-2.ply", "scan-9.ply", "scan-10.ply"],
-        ["2024.01.15.ply", "2024.02.01.ply", "2024.10.01.ply"],
-        ["take1.1.ply", "take1.2.ply", "take1.10.ply", "take1.100.ply", "take2.1.ply"],
-        ["walk.1.ply", "walk.2.ply", "walk.10.ply"],
-        ["a1b2.ply", "a1b10.ply", "a2b1.ply"],
-        ["9.ply", "10.ply", "10a.ply", "b.ply"],
-        ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
-        ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
-        ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
-        ["3e-9f.ply", "3e-10f.ply"],
-        ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
-        ["v1.2.9.ply", "v1.2.10.ply", "v1.10.1.ply"],
-    ],
+@each(
+    ["frame_0.5.xyz", "frame_1.0.xyz", "frame_1.25.xyz", "frame_1.5.xyz", "frame_10.0.xyz"],
+    ["t=0.05.png", "t=0.1.png", "t=0.25.png", "t=0.3.png"],
+    ["t=-2.ply", "t=-0.5.ply", "t=0.ply", "t=1.ply"],
+    ["2024.01.15.ply", "2024.02.01.ply", "2024.10.01.ply"],
+    ["take1.1.ply", "take1.2.ply", "take1.10.ply", "take1.100.ply", "take2.1.ply"],
+    ["9.ply", "10.ply", "10a.ply", "b.ply"],
+    ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
+    ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
+    ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
+    ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
 )
-def test_names_sort_as_a_person_would(names):
-    assert natural_sorted(reversed(names)) == names
-
-
-@pytest.mark.parametrize("name", ["a.ply", "a.xyz", "a.npz"])
-def test_one_file_is_one_frame(tmp_path, name):
-    (cloud,) = clouds(6)
-    save_points(tmp_path / name, cloud)
-    (frame,) = tr.load_frames(tmp_path / name, dtype=torch.float64)
-    torch.testing.assert_close(frame.float(), cloud)
+def test_names_sort_as_a_person_would(tmp_path, names):
+    pictures = [f"{name.rpartition('.')[0]}.png" for name in names]
+    for name in pictures:
+        (tmp_path / name).touch()
+    assert [path.name for path in list_pictures(tmp_path)] == pictures
 
 
 @pytest.mark.parametrize("name", ["points", "vertices", "whatever"])
@@ -207,25 +184,16 @@ def test_frames_that_are_not_finite(tmp_path):
 STACK = np.zeros((2, 4, 3))
 
 
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
-        ({"points": STACK[..., :2]}, r"frame 0 must have shape \(M, 3\), got \(4, 2\)"),
-        ({"points": STACK[:0]}, "holds no frames"),
-        ({"points": STACK, "counts": [1, 5]}, "counts must be 2 numbers from 0 to 4"),
-        ({"points": STACK, "counts": [1]}, "counts must be 2 numbers"),
-        ({"points": STACK, "counts": [1.5, 2]}, "counts must be whole numbers"),
-        ({"points": STACK, "mask": np.ones((2, 3), bool)}, r"mask must have the shape \(2, 4\)"),
-        ({"points": STACK, "mask": np.ones((2, 4))}, "'mask' must hold truth values"),
-        ({"points": STACK, "mask": np.ones((2, 4), bool), "counts": [1, 2]}, "not both"),
-        ({"points": STACK.astype(complex)}, "'points' must hold real numbers"),
-        ({"points": np.full((2, 4, 3), None)}, "pickled objects are never loaded"),
-        ({"frame_0": STACK[0], "frame_1": STACK[0, :, :2]}, "frame 1 must have shape"),
-    ],
+test_damaged_archives = refusing(lambda folder, arrays: tr.load_frames(archived(folder, **arrays)), file="s.npz: ")(
+    ({"points": STACK[..., :2]}, r"frame 0 must have shape \(M, 3\), got \(4, 2\)"),
+    ({"points": STACK[:0]}, "holds no frames"),
+    ({"points": STACK, "counts": [1, 5]}, "counts must be 2 numbers from 0 to 4"),
+    ({"points": STACK, "counts": [1.5, 2]}, "counts must be whole numbers"),
+    ({"points": STACK, "mask": np.ones((2, 3), bool)}, r"mask must have the shape \(2, 4\)"),
+    ({"points": STACK, "mask": np.ones((2, 4), bool), "counts": [1, 2]}, "not both"),
+    ({"points": np.full((2, 4, 3), None)}, "pickled objects are never loaded"),
+    ({"frame_0": STACK[0], "frame_1": STACK[0, :, :2]}, "frame 1 must have shape"),
 )
-def test_archives_that_are_refused(tmp_path, arrays, message):
-    path = archived(tmp_path, **arrays)
-    refused((lambda: tr.load_frames(path), rf"s\.npz: .*{message}"))
 
 
 def test_archives_that_are_none_or_claim_more_than_they_hold(tmp_path):
@@ -237,19 +205,16 @@ def test_archives_that_are_none_or_claim_more_than_they_hold(tmp_path):
     refused((lambda: tr.load_frames(tmp_path / "big.npz"), r"claims the shape \(1000000, 1000000, 3\)"))
 
 
-def readable_or_named(path):
-    try:
-        return all(frame.shape[1] == 3 for frame in tr.load_frames(path, nan_policy="omit"))
-    except FormatError as error:
-        return path.name in str(error)
-
-
 def test_damaged_archives_name_the_file(tmp_path):
     save_frames(tmp_path / "a.npz", clouds(5, 6))
     content = (tmp_path / "a.npz").read_bytes()
     for place in range(0, len(content), 7):
         damaged = content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :]
-        assert readable_or_named(put(tmp_path, "b.npz", damaged)), place
+        try:
+            widths = {frame.shape[1] for frame in tr.load_frames(put(tmp_path, "b.npz", damaged), nan_policy="omit")}
+        except FormatError as error:
+            widths = {3} if "b.npz" in str(error) else {str(error)}
+        assert widths <= {3}, place
 
 
 def test_limits_hold_for_archives_and_files(tmp_path):
@@ -264,25 +229,23 @@ def test_limits_hold_for_archives_and_files(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("path", "options", "error", "words"),
-    [
-        ("none.ply", {}, FileNotFoundError, r"none\.ply"),
-        (".", {}, FormatError, "holds no frames: no file ends in one of"),
-        ([], {}, FormatError, "empty list"),
-        (["."], {}, IsADirectoryError, "pass it alone"),
-        ("https://example.org/frames", {}, FormatError, "is an address"),
-        (3, {}, tr.errors.InputTypeError, "path must be a path or a list of paths, got int"),
-        (".", {"dtype": torch.float16}, tr.errors.InputTypeError, "dtype must be"),
-        (".", {"nan_policy": "ignore"}, InputError, "nan_policy must be one of"),
-        ("notes.md", {}, FormatError, r"unknown ending '\.md'"),
-    ],
+def loading(folder, path, options):
+    notes = put(folder, "notes.md", "no cloud")
+    inside = {".": folder, "none.ply": folder / "none.ply", "notes.md": notes}
+    tr.load_frames([folder] if path == ["."] else path if path == [] else inside.get(path, path), **options)
+
+
+test_what_cannot_be_loaded = refusing(loading)(
+    ("none.ply", {}, FileNotFoundError, r"none\.ply"),
+    (".", {}, FormatError, "holds no frames: no file ends in one of"),
+    ([], {}, FormatError, "empty list"),
+    (["."], {}, IsADirectoryError, "pass it alone"),
+    ("https://example.org/frames", {}, FormatError, "is an address"),
+    (3, {}, tr.errors.InputTypeError, "path must be a path or a list of paths, got int"),
+    (".", {"dtype": torch.float16}, tr.errors.InputTypeError, "dtype must be"),
+    (".", {"nan_policy": "ignore"}, InputError, "nan_policy must be one of"),
+    ("notes.md", {}, FormatError, r"unknown ending '\.md'"),
 )
-def test_what_cannot_be_loaded(tmp_path, monkeypatch, path, options, error, words):
-    monkeypatch.chdir(tmp_path)
-    put(tmp_path, "notes.md", "no cloud")
-    with pytest.raises(error, match=words):
-        tr.load_frames(path, **options)
 
 
 def test_folders_leave_other_files_alone_but_mix_no_formats(tmp_path):
@@ -300,26 +263,19 @@ def test_folders_leave_other_files_alone_but_mix_no_formats(tmp_path):
     refused((lambda: tr.load_frames(tmp_path), r"several formats \(2 \.ply, 1 \.xyz\)"))
 
 
-@pytest.mark.parametrize(
-    ("name", "frames", "error", "words"),
-    [
-        ("a.npz", [], InputError, "at least one cloud"),
-        (
-            "a.npz",
-            [torch.zeros(2, 3), torch.zeros(2, 2)],
-            InputError,
-            r"frames\[1\] must have shape \(M, 3\), got \(2, 2\)",
-        ),
-        ("a.npz", [torch.full((1, 3), torch.nan)], InputError, r"frames\[0\] must be finite"),
-        ("f", clouds(2, 0), InputError, r"frames\[1\] has no points"),
-        ("a.ply", clouds(2), FormatError, r"ending '\.ply'"),
-        ("no/f", clouds(2), FileNotFoundError, None),
-    ],
+test_what_cannot_be_saved = refusing(lambda folder, name, frames: save_frames(folder / name, frames), leaves=0)(
+    ("a.npz", [], InputError, "at least one cloud"),
+    (
+        "a.npz",
+        [torch.zeros(2, 3), torch.zeros(2, 2)],
+        InputError,
+        r"frames\[1\] must have shape \(M, 3\), got \(2, 2\)",
+    ),
+    ("a.npz", [torch.full((1, 3), torch.nan)], InputError, r"frames\[0\] must be finite"),
+    ("f", clouds(2, 0), InputError, r"frames\[1\] has no points"),
+    ("a.ply", clouds(2), FormatError, r"ending '\.ply'"),
+    ("no/f", clouds(2), FileNotFoundError, None),
 )
-def test_what_cannot_be_saved(tmp_path, name, frames, error, words):
-    with pytest.raises(error, match=words):
-        save_frames(tmp_path / name, frames)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_shorter_sequence_is_not_mixed_into_a_longer_one(tmp_path):

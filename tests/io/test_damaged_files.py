@@ -14,12 +14,12 @@ import torch
 import trimesh
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
 from tests.io.test_binary_clouds import QUAD, pcd, ply, stl, stl_text
+from tests.tables import each, refused
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
+from torchreg.io.limits import FileLimits
 from torchreg.io.points import save_points
-from torchreg.io.strict_xml import parse_xml
 
 FormatError, FileWarning, InputError = tr.errors.FormatError, tr.errors.FileWarning, tr.errors.InputError
 SPHERE = unit_sphere(0, dtype=torch.float64)
@@ -124,33 +124,30 @@ def test_damaged_header_digits_never_pass_unnoticed(files, tmp_path, name, word,
     assert outcome(tmp_path / name, files[name].replace(word, word[:-2] + claim)) == 0
 
 
-@pytest.mark.parametrize(
-    "address",
-    ["http://host/a", "file:///etc/passwd", "s3://bucket/a", "HTTPS://host/a", Path("http://host/a"), "\\\\h\\s"],
-)
+@each("http://host/a", "file:///etc/passwd", "s3://bucket/a", "HTTPS://host/a", Path("http://host/a"), "\\\\h\\s")
 def test_addresses_are_refused(address):
-    with pytest.raises(FormatError, match="is an address, not a local file: download it first"):
-        read_bytes(address)
+    refused((lambda: tr.load_points(address), "is an address, not a local file: download it first"))
 
 
 def test_local_files_are_read_and_what_is_none_is_refused(tmp_path):
-    path = put(tmp_path, "a b:c.bin", b"content")
-    assert read_bytes(str(path), FileLimits(max_bytes=7)) == b"content"
+    path = put(tmp_path, "a b:c.xyz", "1 2 3\n")
+    assert len(tr.load_points(str(path), limits=FileLimits(max_bytes=6))) == 1
     (tmp_path / "link").symlink_to(path)
-    assert read_bytes(tmp_path / "link") == b"content"
-    assert local_path("C:/scans/a.ply") == Path("C:/scans/a.ply")
+    assert len(tr.load_points(tmp_path / "link")) == 1
     with (tmp_path / "big").open("wb") as stream:
         stream.truncate(10 * 1024**3)  # sparse: takes no room
     big = rf"big holds {10 * 1024**3} bytes, the limit is {2 * 1024**3}"
-    refused((lambda: read_bytes(tmp_path / "missing"), "missing"), error=FileNotFoundError)
-    refused((lambda: read_bytes(tmp_path), "is a folder"), error=IsADirectoryError)
-    refused((lambda: read_bytes(""), "not the name of"), (lambda: read_bytes("a\0b"), "not the name of a file"))
+    refused(*((lambda name=name: tr.load_points(tmp_path / name), "missing") for name in ("missing", "missing.xyz")),
+            (lambda: tr.load_points("C:/scans/missing.xyz"), "missing"), error=FileNotFoundError)  # fmt: skip
+    refused((lambda: tr.load_points(tmp_path), "is a folder"), error=IsADirectoryError)
     refused(
-        (lambda: read_bytes(path, FileLimits(max_bytes=6)), "limit is 6"), (lambda: read_bytes(tmp_path / "big"), big)
+        (lambda: tr.load_points(""), "not the name of"),
+        (lambda: tr.load_points("a\0b"), "not the name of a file"),
+        (lambda: tr.load_points(path, limits=FileLimits(max_bytes=5)), "limit is 5"),
+        (lambda: tr.load_points(tmp_path / "big"), big),
     )
-    for value in (3, b"bytes", None):
-        words = r"path must be a str or a pathlib\.Path"
-        refused((lambda value=value: read_bytes(value), words), error=tr.errors.InputTypeError)
+    words = r"path must be a str or a pathlib\.Path"
+    refused(*((lambda v=v: tr.load_points(v), words) for v in (3, b"bytes", None)), error=tr.errors.InputTypeError)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes and devices of POSIX")
@@ -159,8 +156,12 @@ def test_pipes_devices_and_sockets_are_refused_without_waiting(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)  # names of sockets are short
     with socket.socket(socket.AF_UNIX) as server:
         server.bind("socket")
-        for path in (tmp_path / "pipe", "/dev/zero", "socket"):
-            refused((lambda path=path: read_bytes(path), "is not a regular file"))
+        refused(
+            *(
+                (lambda name=name: tr.load_points(name), "is not a regular file")
+                for name in ("pipe", "/dev/zero", "socket")
+            )
+        )
 
 
 @pytest.mark.parametrize("name", ["max_bytes", "max_points", "max_faces", "max_zip_ratio", "max_expanded_bytes"])
@@ -168,40 +169,3 @@ def test_pipes_devices_and_sockets_are_refused_without_waiting(tmp_path, monkeyp
 def test_limits_must_be_positive(name, value):
     with pytest.raises(InputError, match=f"{name} must be a positive number"):
         FileLimits(**{name: value})
-
-
-def test_counts_are_allowed_up_to_the_limit():
-    check_allowed(DEFAULT_LIMITS.max_points, "points", DEFAULT_LIMITS)
-    check_allowed(5, "points", FileLimits(max_points=5))
-    words = r"claims 6 points, allowed are 0 to 5; .* FileLimits\(max_points=\.\.\.\)"
-    refused(
-        (lambda: check_allowed(6, "points", FileLimits(max_points=5)), words),
-        (lambda: check_allowed(-1, "faces", DEFAULT_LIMITS), "claims -1 faces"),
-    )
-
-
-def test_elements_of_xml_come_as_they_stand():
-    root = parse_xml(b"\n <?xml version='1.0'?><a x='1'>t<b/><!-- c --><b y='&lt;'/></a>")
-    assert (root.tag, root.attrib, root.text) == ("a", {"x": "1"}, "t")
-    assert [child.attrib for child in root] == [{}, {"y": "<"}]
-    assert parse_xml("<?xml version='1.0' encoding='utf-16'?><a x='ü'/>".encode("utf-16")).get("x") == "ü"
-    assert len(parse_xml(b"<a>" + b"<b></b>" * 500 + b"</a>")) == 500
-    parse_xml(b"<a>" * 64 + b"</a>" * 64)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "not well-formed XML"),
-        (b"<a>", "not well-formed XML"),
-        (b"<a></b>", "not well-formed XML"),
-        (b"<?xml version='1.0' encoding='klingon'?><a/>", "not well-formed XML"),
-        (b"<a>\xff</a>", "not well-formed XML"),
-        (b"<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", r"document type declaration \('a'\)"),
-        (b"<!DOCTYPE a SYSTEM 'file:///etc/passwd'><a/>", "document type declaration"),
-        (b"<a>" * 65 + b"</a>" * 65, "nests elements more than 64 deep"),
-    ],
-)
-def test_xml_that_is_refused(content, message):
-    with pytest.raises(FormatError, match=message):
-        parse_xml(content)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.io.helpers import put, refused
-from torchreg.io import atomic
+from tests.io.helpers import put
+from tests.tables import refused
 from torchreg.io.atomic import write_atomic
 
 
@@ -60,7 +60,11 @@ def test_a_killed_process_leaves_the_old_file(tmp_path, step):
         f"os.{step} = lambda *_: os._exit(9)\n"
         "write(pathlib.Path(sys.argv[2]), b'new')\n"
     )
-    ended = subprocess.run([sys.executable, "-I", "-c", program, atomic.__file__, str(path)], check=False, timeout=60)
+    ended = subprocess.run(
+        [sys.executable, "-I", "-c", program, sys.modules[write_atomic.__module__].__file__, str(path)],
+        check=False,
+        timeout=60,
+    )
     assert ended.returncode == 9
     assert path.read_bytes() == b"old"
     # What is left over is hidden and named like nothing that a loader takes.

@@ -1,51 +1,30 @@
 """Keypoints that a detector measured, from files."""
 
-import json
-
-import pytest
 import torch
 
-from torchreg.errors import FormatError
+from tests.io.helpers import put
+from tests.tables import refused, refusing
 from torchreg.io.keypoints import load_keypoints
 
 
-@pytest.fixture
-def written(tmp_path):
-    def write(content, name="k.json"):
-        path = tmp_path / name
-        path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
-        return path
-
-    return write
-
-
-def test_one_frame_and_several_with_unseen_keypoints(written):
-    one = load_keypoints(written([[1, 2.5], None, [3, 4]]))
+def test_one_frame_and_several_with_unseen_keypoints(tmp_path):
+    one = load_keypoints(put(tmp_path, "k.json", [[1, 2.5], None, [3, 4]]))
     assert one.shape == (1, 3, 2)
     assert one[0, 1].isnan().all()
     torch.testing.assert_close(one[0, [0, 2]], torch.tensor([[1, 2.5], [3, 4]], dtype=torch.float64))
-    several = load_keypoints(written([None, [[1, 2, 3], None], [None, None]]))
+    several = load_keypoints(put(tmp_path, "k.json", [None, [[1, 2, 3], None], [None, None]]))
     assert several.shape == (3, 2, 3)
     assert several.isfinite().all(-1).tolist() == [[False, False], [True, False], [False, False]]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "cannot be read as JSON"),
-        ([], "must hold a list of keypoints"),
-        ({"keypoints": []}, "must hold a list of keypoints .* an object with keypoints"),
-        ([None, None], "must hold a list of keypoints"),
-        ([[1, 2], [1, 2, 3]], r"of \[2, 3\] numbers"),
-        ([[[1, 2]], [[1, 2], [3, 4]]], r"lists of \[1, 2\] keypoints"),
-        ([["a", 2]], "must hold numbers, got 'a'"),
-        ([[True, 2]], "must hold numbers, got True"),
-        ("[[1e999, 2]]", "must hold numbers, got inf"),
-    ],
+test_other_lists = refusing(lambda folder, content: load_keypoints(put(folder, "k.json", content)), file="k.json: ")(
+    ("{", "cannot be read as JSON"),
+    ({"keypoints": []}, "must hold a list of keypoints .* an object with keypoints"),
+    ([[1, 2], [1, 2, 3]], r"of \[2, 3\] numbers"),
+    ([[[1, 2]], [[1, 2], [3, 4]]], r"lists of \[1, 2\] keypoints"),
+    ([["a", 2]], "must hold numbers, got 'a'"),
+    ("[[1e999, 2]]", "must hold numbers, got inf"),
 )
-def test_other_content_is_refused_by_the_name_of_the_file(written, content, message):
-    with pytest.raises(FormatError, match=rf"k\.json: .*{message}"):
-        load_keypoints(written(content))
 
 
 def openpose(right, left=()):
@@ -60,11 +39,11 @@ def mediapipe(*hands):
     }
 
 
-def test_files_of_openpose_give_pixels_of_one_side_frame_by_frame(written, tmp_path):
+def test_files_of_openpose_give_pixels_of_one_side_frame_by_frame(tmp_path):
     right = [float(number) for number in range(63)]
     right[5] = 0.0  # the second keypoint's confidence: not seen
-    written(openpose(right, [1.0] * 63), "v_000000000010_keypoints.json")
-    written({"version": 1.3, "people": []}, "v_000000000009_keypoints.json")
+    put(tmp_path, "v_000000000010_keypoints.json", openpose(right, [1.0] * 63))
+    put(tmp_path, "v_000000000009_keypoints.json", {"version": 1.3, "people": []})
     frames = load_keypoints(tmp_path, side="right")
     assert frames.shape == (2, 21, 2)
     assert frames[0].isnan().all()
@@ -73,38 +52,32 @@ def test_files_of_openpose_give_pixels_of_one_side_frame_by_frame(written, tmp_p
     assert (load_keypoints(tmp_path, side="left")[1] == 1).all()
 
 
-def test_files_of_mediapipe_give_pixels_of_the_picture(written):
+def test_files_of_mediapipe_give_pixels_of_the_picture(tmp_path):
     share = [(k / 21, 0.5) for k in range(21)]
     content = [mediapipe((share, "Left"), (share[::-1], "Right")), mediapipe((share, "Left")), mediapipe()]
-    frames = load_keypoints(written(content), side="right", picture=(640, 480))
+    frames = load_keypoints(put(tmp_path, "k.json", content), side="right", picture=(640, 480))
     assert frames.shape == (3, 21, 2)
     torch.testing.assert_close(frames[0, 20], torch.tensor([-0.5, 239.5], dtype=torch.float64))
     torch.testing.assert_close(frames[1, 0], torch.tensor([-0.5, 239.5], dtype=torch.float64))
     assert frames[2].isnan().all()
     old = {"landmark": content[1]["hand_landmarks"][0]}
-    torch.testing.assert_close(load_keypoints(written(old), picture=(640, 480))[0], frames[1])
+    torch.testing.assert_close(load_keypoints(put(tmp_path, "k.json", old), picture=(640, 480))[0], frames[1])
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (openpose([1.0] * 62), "must hold 63 numbers"),
-        (openpose(["a"] * 63), "must hold numbers, got 'a'"),
-        (mediapipe(([(0, 0)] * 20, "Left")), "must have 21 landmarks"),
-        ({"landmark": [{"x": 1}] * 21}, "must have x and y"),
-        ({"boxes": []}, "or what MediaPipe .* got an object with boxes"),
-    ],
+test_other_detections = refusing(
+    lambda folder, content: load_keypoints(put(folder, "k.json", content), picture=(640, 480)), file="k.json: "
+)(
+    (openpose([1.0] * 62), "must hold 63 numbers"),
+    (openpose(["a"] * 63), "must hold numbers, got 'a'"),
+    (mediapipe(([(0, 0)] * 20, "Left")), "must have 21 landmarks"),
+    ({"landmark": [{"x": 1}] * 21}, "must have x and y"),
+    ({"boxes": []}, "or what MediaPipe .* got an object with boxes"),
 )
-def test_other_content_of_detectors_is_refused(written, content, message):
-    with pytest.raises(FormatError, match=rf"k\.json: .*{message}"):
-        load_keypoints(written(content), picture=(640, 480))
 
 
-def test_shares_of_a_picture_need_its_size(written):
-    with pytest.raises(FormatError, match="shares of a picture whose size is not known"):
-        load_keypoints(written(mediapipe()))
-
-
-def test_other_endings_are_refused(written):
-    with pytest.raises(FormatError, match=r"must end in \.json"):
-        load_keypoints(written([], "k.txt"))
+def test_shares_of_a_picture_need_its_size_and_the_ending_is_json(tmp_path):
+    path, text = put(tmp_path, "k.json", mediapipe()), put(tmp_path, "k.txt", [])
+    refused(
+        (lambda: load_keypoints(path), "shares of a picture whose size is not known"),
+        (lambda: load_keypoints(text), r"must end in \.json"),
+    )

@@ -9,8 +9,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import Scene, put, refused, shift
-from tests.io.test_written_gltf import Player
+from tests.gltf_player import Player
+from tests.io.helpers import Scene, put, shift
+from tests.tables import refused
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_file.refit import save_refitted_rig

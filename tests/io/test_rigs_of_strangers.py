@@ -8,7 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import torchreg as tr
-from tests.io.helpers import FACES, TURN, UPPER, VERTICES, Scene, refused, shift
+from tests.io.helpers import FACES, TURN, UPPER, VERTICES, Scene, shift
+from tests.tables import each_row, refused
 from torchreg.io.gltf import load_rig
 
 FileWarning = tr.errors.FileWarning
@@ -35,14 +36,11 @@ def second_skin(scene, joints, inverse, vertices=VERTICES, **changes):
     scene.node(root=True, name="clothes", mesh=mesh, skin=scene.skin(joints, inverse, name="clothes"))
 
 
-@pytest.mark.parametrize(
-    ("joints", "inverse", "place"),
-    [
-        ([1, 0], [shift(0, 0, 0), shift(0, -1, 0)], VERTICES),  # in the order root, tip, as is the body
-        ([0, 1], [shift(0, -1, 0), shift(0, 0, 0)], VERTICES),
-        # Stored in centimetres, and elsewhere.
-        ([1, 0], [SMALL, shift(0, -1, 0) @ SMALL], 100 * VERTICES + np.array([500, 0, 0])),
-    ],
+@each_row(
+    ([1, 0], [shift(0, 0, 0), shift(0, -1, 0)], VERTICES),  # in the order root, tip, as is the body
+    ([0, 1], [shift(0, -1, 0), shift(0, 0, 0)], VERTICES),
+    # Stored in centimetres, and elsewhere.
+    ([1, 0], [SMALL, shift(0, -1, 0) @ SMALL], 100 * VERTICES + np.array([500, 0, 0])),
 )
 def test_skins_on_one_skeleton_are_one_shape(tmp_path, scene, joints, inverse, place):
     scene.rig()
@@ -109,16 +107,11 @@ def test_an_armature_that_turns_its_rig_stands_it_up(tmp_path, tip, joint):
     np.testing.assert_allclose(off - off.mean(0), 0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("scale", "told"),
-    [
-        ([1, 1, 1.3], "0.3 of it unlike others: 'tip'; this is baked"),
-        ([2, 2, 2], "1 of it unlike others: 'tip'; this is baked"),
-        ([1, 1, -1], "2 of it unlike others: 'tip'; this is baked"),
-        ([1.5, 0.8, 1], "0.5 of it unlike others: 'tip'; this is baked"),
-        ([1.02, 1.02, 1.02], "0.02 of it unlike others: 'tip'; this is left out"),
-        ([1, 0.99, 1], "0.01 of it unlike others: 'tip'; this is left out"),
-    ],
+@each_row(
+    ([1, 1, 1.3], "0.3 of it unlike others: 'tip'; this is baked"),
+    ([1, 1, -1], "2 of it unlike others: 'tip'; this is baked"),
+    ([1.5, 0.8, 1], "0.5 of it unlike others: 'tip'; this is baked"),
+    ([1.02, 1.02, 1.02], "0.02 of it unlike others: 'tip'; this is left out"),
 )
 def test_scales_of_bones_are_baked_unless_they_are_small(tmp_path, scene, scale, told):
     scene.rig(tip={"scale": scale, "rotation": TURN} if max(scale) > 1.1 else {"scale": scale})
@@ -219,20 +212,6 @@ def test_degrees_of_freedom_that_have_the_name_of_a_joint_are_told_apart(tmp_pat
     with pytest.warns(FileWarning, match="a degree of freedom is called 'root_x_y#', as a joint is called 'root_x_y'"):
         shape = tr.ArticulatedShape.from_gltf(scene.save(tmp_path / "a.glb"))
     assert shape.dof_names[6:9] == ("root_x_x", "root_x_y#", "root_x_z")
-
-
-def test_quantized_geometry_is_read(tmp_path, scene):
-    """Positions of 16 bits, which the inverse bind matrices put right, as gltfpack writes them."""
-    step = np.diag([4 / 60000] * 3 + [1.0])
-    stored = np.round(VERTICES / step[0, 0]).astype("i2")
-    shares = np.round(255 * np.stack([1 - UPPER, UPPER, 0 * UPPER, 0 * UPPER], 1)).astype("u1")
-    scene.json["extensionsRequired"] = ["KHR_mesh_quantization"]
-    primitive = scene.primitive(POSITION=stored, WEIGHTS_0=(shares, True))
-    scene.rig([primitive], inverse=[step, shift(0, -1, 0) @ step])
-    path = scene.save(tmp_path / "a.glb")
-    _, vertices = at_zero(path)
-    np.testing.assert_allclose(vertices, VERTICES, atol=1e-4)
-    np.testing.assert_allclose(vertices, shown(path), atol=1e-6)
 
 
 def compressed(scene, encode):

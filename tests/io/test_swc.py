@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from torchreg.errors import FormatError, InputError
-from torchreg.geometry.skeleton import Skeleton
+import torchreg as tr
+from tests.io.helpers import put
+from tests.tables import refused, refusing
 from torchreg.io.swc import load_swc, save_swc
 
 
@@ -13,7 +14,7 @@ def made(seed=0, count=12):
     parents = [int(torch.randint(0, node, (1,), generator=generator)) for node in range(1, count)]
     edges = torch.tensor([[parent, node] for node, parent in enumerate(parents, start=1)])
     nodes = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    return Skeleton(nodes, edges, torch.rand(count, generator=generator, dtype=torch.float64))
+    return tr.Skeleton(nodes, edges, torch.rand(count, generator=generator, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -30,8 +31,9 @@ def test_a_tree_comes_back(tmp_path, seed):
 
 
 def test_parents_come_first_and_types_tell_ends_and_branchings(tmp_path):
-    star = Skeleton(torch.randn(4, 3), torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.ones(4))
+    star = tr.Skeleton(torch.randn(4, 3), torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.ones(4))
     save_swc(tmp_path / "a.swc", star)
+    refused((lambda: save_swc(tmp_path / "a.txt", star), r"must end in \.swc"), error=tr.errors.InputError)
     rows = [line.split() for line in (tmp_path / "a.swc").read_text().splitlines() if not line.startswith("#")]
     assert all(int(row[6]) < int(row[0]) for row in rows)
     assert [row[1] for row in rows] == ["6", "5", "6", "6"]
@@ -39,30 +41,14 @@ def test_parents_come_first_and_types_tell_ends_and_branchings(tmp_path):
 
 
 def test_files_of_others_are_read(tmp_path):
-    path = tmp_path / "a.swc"
-    path.write_text("# from elsewhere\n\n10 1 0 0 0 1.5 -1\n12 3 1 0 0 .5 10 # dendrite\n11 3 2 0 0 0.25 12\n")
-    skeleton = load_swc(path)
+    text = "# from elsewhere\n\n10 1 0 0 0 1.5 -1\n12 3 1 0 0 .5 10 # dendrite\n11 3 2 0 0 0.25 12\n"
+    skeleton = load_swc(put(tmp_path, "a.swc", text))
     assert skeleton.edges.tolist() == [[0, 1], [1, 2]]
     assert skeleton.radii.tolist() == [1.5, 0.5, 0.25]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("1 1 0 0 0 1\n", "line 1 is no node .6 columns"),
-        ("1 1 0 0 x 1 -1\n", "line 1 is no node"),
-        ("1 1 0 0 0 1 -1\n2 1 0 0 0 1 7\n", "make no tree"),
-        ("1 1 0 0 0 1 -1\n2 1 0 0 0 1 -1\n", "make no tree"),
-        ("1 1 0 0 nan 1 -1\n", "make no tree"),
-        ("", "make no tree"),
-    ],
-)
-def test_damaged_files_are_refused_by_name(tmp_path, content, message):
-    (tmp_path / "bad.swc").write_text(content)
-    with pytest.raises(FormatError, match=rf"bad\.swc: .*{message}"):
-        load_swc(tmp_path / "bad.swc")
-
-
-def test_the_ending_is_checked(tmp_path):
-    with pytest.raises(InputError, match=r"must end in \.swc"):
-        save_swc(tmp_path / "a.txt", made())
+test_damaged_swc = refusing(lambda folder, content: load_swc(put(folder, "bad.swc", content)), file="bad.swc: ")(
+    ("1 1 0 0 x 1 -1\n", "line 1 is no node"), ("1 1 0 0 0 1 -1\n2 1 0 0 0 1 7\n", "make no tree"),
+    ("1 1 0 0 0 1 -1\n2 1 0 0 0 1 -1\n", "make no tree"), ("1 1 0 0 nan 1 -1\n", "make no tree"),
+    ("", "make no tree"),
+)  # fmt: skip

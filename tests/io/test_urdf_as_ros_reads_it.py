@@ -6,8 +6,9 @@ import pytest
 import trimesh
 
 import torchreg as tr
-from tests.io.helpers import put, refused
+from tests.io.helpers import put
 from tests.io.test_urdf import link, robot
+from tests.tables import each, each_row, refused
 from torchreg.io.urdf import load_urdf
 
 FileWarning, UnitsWarning = tr.errors.FileWarning, tr.errors.UnitsWarning
@@ -27,22 +28,16 @@ def saved(folder, content):
     return put(folder, "arm.urdf", content)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        ARM.replace("<robot name", "<robot xmlns='http://www.ros.org' name"),
-        ARM.replace("<robot name", "<robot xmlns:xi='http://www.w3.org/2001/XInclude' name"),
-        ARM.replace("</robot>", "<sensor:camera name='eye'><rate>30</rate></sensor:camera></robot>"),
-        ARM.replace("<", "<u:").replace("<u:/", "</u:").replace("<u:robot", "<u:robot xmlns:u='http://ros.org'"),
-        "<!-- generated -->\n<?xml version='1.0'?>\n" + ARM,
-        "<!-- a -->\n<!-- b -->\n\n<?xml version='1.0' encoding='UTF-8'?>\n" + ARM,
-        ARM.replace("</robot>", "<!-- <link name='old'/> -- kept for later --></robot>"),
-        ARM.replace("</robot>", "<!-- <link name='old'><!-- inner --></link> --></robot>"),
-        ARM + "\0\0\n",
-        b"\xef\xbb\xbf" + ARM.encode(),
-        ("<?xml version='1.0' encoding='utf-16'?>" + ARM).encode("utf-16"),
-        b"\r\n \n<?xml version='1.0'?>" + ARM.replace("\n", "\r\n").encode(),
-    ],
+@each(
+    ARM.replace("<robot name", "<robot xmlns='http://www.ros.org' name"),
+    ARM.replace("</robot>", "<sensor:camera name='eye'><rate>30</rate></sensor:camera></robot>"),
+    ARM.replace("<", "<u:").replace("<u:/", "</u:").replace("<u:robot", "<u:robot xmlns:u='http://ros.org'"),
+    "<!-- generated -->\n<?xml version='1.0'?>\n" + ARM,
+    ARM.replace("</robot>", "<!-- <link name='old'/> -- kept for later --></robot>"),
+    ARM.replace("</robot>", "<!-- <link name='old'><!-- inner --></link> --></robot>"),
+    ARM + "\0\0\n",
+    ("<?xml version='1.0' encoding='utf-16'?>" + ARM).encode("utf-16"),
+    b"\r\n \n<?xml version='1.0'?>" + ARM.replace("\n", "\r\n").encode(),
 )
 def test_xml_that_is_not_strict(tmp_path, content):
     record = load_urdf(saved(tmp_path, content))
@@ -50,55 +45,40 @@ def test_xml_that_is_not_strict(tmp_path, content):
     assert [len(solids) for solids in record.link_primitives] == [1, 1]
 
 
-@pytest.mark.parametrize("kind", ["floating", "planar"])
-def test_joints_of_several_degrees_of_freedom_are_held(tmp_path, kind):
-    with pytest.warns(FileWarning, match=f"joint 'to_tip' is {kind}; it is held fixed"):
-        record = load_urdf(saved(tmp_path, robot(link("base"), link("tip"), joint("tip", kind, ""))))
-    assert [frame.kind for frame in record.tree.joints] == ["fixed", "fixed"]
-    assert record.tree.joints[1].offset[:3, 3].tolist() == [0, 0, 0.4]
+DEGREES, TIP = "<limit lower='-180' upper='180'/>", link("base") + link("tip")
 
 
-@pytest.mark.parametrize(
-    ("shape", "words"),
-    [
-        ("<box size='0 0 0'/>", r"visual of link 'tip' is left out: <box> needs a positive size, got \(0\.0"),
+@each_row(
+    *((TIP + joint("tip", kind, ""), f"joint 'to_tip' is {kind}; it is held") for kind in ("floating", "planar")),
+    (TIP + joint("tip") + link("table"), "1 of 3 links are left out, as no joint ties .* largest tree: table"),
+    (TIP + joint("tip", limits=DEGREES), r"'to_tip' has limits -180 to 180, .* write -3\.142 to 3\.142"),
+    (link("base", origin="<origin rpy='0 0 90'/>"), "visual of link 'base' is turned by rpy 0 0 90, which are"),
+    (link("base", origin="<origin xyz='1 0 0'/><origin xyz='2 0 0'/>"), "'base' has 2 origins; the first counts"),
+    *((link("base") + link("tip", shape) + joint("tip"), words) for shape, words in (
+        ("<box size='0 0 0'/>", r"of link 'tip' is left out: <box> needs a positive size, got \(0\.0"),
         ("<cylinder radius='1'/>", "<cylinder> needs a positive radius and length"),
         ("<plane normal='0 0 1'/>", "its geometry <plane> is none of mesh, box"),
         ("<mesh/>", "its <mesh> has no filename"),
-    ],
-)
-def test_geometry_that_is_none_is_left_out(tmp_path, shape, words):
-    path = saved(tmp_path, robot(link("base"), link("tip", shape), joint("tip")))
+    )),
+)  # fmt: skip
+def test_what_is_left_out_held_or_unlikely_is_warned_of(tmp_path, text, words):
     with pytest.warns(FileWarning, match=rf"arm\.urdf: .*{words}"):
-        assert tr.ArticulatedShape.from_urdf(path).part_names == ("base",)
+        record = load_urdf(saved(tmp_path, robot(text)))
+    assert all(frame.kind == "fixed" for frame in record.tree.joints) == ("is held" in words or len(record.tree) == 1)
+    assert record.link_names == (("base", "tip") if "tip" in text else ("base",))
+    if "origins" in words:
+        assert record.link_primitives[0][0].origin[0, 3] == 1
+    if "<" in words:
+        assert record.link_primitives[1] == ()
 
 
-def test_a_robot_without_any_geometry_is_refused(tmp_path):
+def test_limits_of_a_turn_are_radians_and_a_robot_needs_geometry(tmp_path):
+    for limits in ("<limit lower='-6.3' upper='6.3'/>", "<limit lower='-1e16' upper='1e16'/>"):
+        load_urdf(saved(tmp_path, robot(TIP, joint("tip", limits=limits))))
     path = saved(tmp_path, robot(link("base", "<mesh/>")))
     words = r"arm\.urdf: no link has geometry that can be read"
     with pytest.warns(FileWarning, match="is left out"):
         refused((lambda: tr.ArticulatedShape.from_urdf(path), words), error=tr.errors.ModelError)
-
-
-def test_links_beside_the_largest_tree_are_left_out(tmp_path):
-    path = saved(tmp_path, robot(link("base"), link("tip"), joint("tip"), link("table")))
-    with pytest.warns(FileWarning, match="1 of 3 links are left out, as no joint ties them to the largest tree: table"):
-        assert load_urdf(path).link_names == ("base", "tip")
-
-
-def test_limits_and_turns_in_degrees_and_doubled_origins_are_told(tmp_path):
-    limits = "<limit lower='-180' upper='180'/>"
-    with pytest.warns(FileWarning, match=r"'to_tip' has limits -180 to 180, .* write -3\.142 to 3\.142"):
-        load_urdf(saved(tmp_path, robot(link("base"), link("tip"), joint("tip", limits=limits))))
-    turned = link("base", origin="<origin rpy='0 0 90'/>")
-    with pytest.warns(FileWarning, match="visual of link 'base' is turned by rpy 0 0 90, which are radians"):
-        load_urdf(saved(tmp_path, robot(turned)))
-    twice = link("base", origin="<origin xyz='1 0 0'/><origin xyz='2 0 0'/>")
-    with pytest.warns(FileWarning, match="visual of link 'base' has 2 origins; the first counts"):
-        record = load_urdf(saved(tmp_path, robot(twice)))
-    assert record.link_primitives[0][0].origin[0, 3] == 1
-    for limits in ("<limit lower='-6.3' upper='6.3'/>", "<limit lower='-1e16' upper='1e16'/>"):
-        load_urdf(saved(tmp_path, robot(link("base"), link("tip"), joint("tip", limits=limits))))
 
 
 @pytest.fixture
@@ -111,14 +91,11 @@ def meshes(tmp_path):
     return package
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../meshes/Box.STL", "meshes/Box.STL", "package://arm_description/meshes/Box.STL",
-        "package://renamed/meshes/Box.STL", r"..\meshes\Box.STL", r"package://arm_description\meshes\Box.STL",
-        "../meshes/box.stl", "file:///home/someone/ws/src/arm_description/meshes/Box.STL",
-        r"C:\robots\arm_description\meshes\box.stl",
-    ],
+@each(
+    "../meshes/Box.STL", "meshes/Box.STL", "package://arm_description/meshes/Box.STL",
+    "package://renamed/meshes/Box.STL", r"..\meshes\Box.STL", r"package://arm_description\meshes\Box.STL",
+    "../meshes/box.stl", "file:///home/someone/ws/src/arm_description/meshes/Box.STL",
+    r"C:\robots\arm_description\meshes\box.stl",
 )  # fmt: skip
 def test_meshes_are_found_from_the_file_above_it_and_as_on_other_machines(meshes, name):
     path = saved(meshes / "urdf", robot(link("base", f"<mesh filename='{name}'/>", origin="")))
@@ -158,19 +135,18 @@ def times(numbers, factor, only=None):
     return tuple(factor * x if only is None or k == only else x for k, x in enumerate(numbers))
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (chained(times(RIGHT, 1000)), r"links 'base', 'turret', 'upper' and 1 more are .*in millimeters; .* by 0\.001"),
-        (chained(times(RIGHT, 1000), mesh="unit.stl"), rescaled("millimeters", 0.001)),
-        (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m .*millimeters"),
-        (chained(times(RIGHT, 100), mesh="unit.stl"), rescaled("centimeters", 0.01)),
-        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), rescaled("inches", 0.0254)),
-        (chained(RIGHT, times(STEPS, 1000)), r"joints .*'to_upper'.* up to 400 m from .*beside links .*in millimeters"),
-        (chained(RIGHT, times(STEPS, 1000, 1)), r"joint 'to_upper' is up to 400 m from the parent"),
-        (chained(RIGHT, slide="0 85"), r"joint 'grip' slides from 0 to 85 m, .* in millimeters; write 0 to 0\.085"),
-        (chained(RIGHT, slide="-40 0"), r"joint 'grip' slides from -40 to 0 m, .*write -0\.04 to 0"),
-    ],
+@each_row(
+    (chained(times(RIGHT, 1000)), r"links 'base', 'turret', 'upper' and 1 more are .*in millimeters; .* by 0\.001"),
+    (chained(times(RIGHT, 1000), mesh="unit.stl"), rescaled("millimeters", 0.001)),
+    (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m .*millimeters"),
+    (chained(times(RIGHT, 100), mesh="unit.stl"), rescaled("centimeters", 0.01)),
+    (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), rescaled("inches", 0.0254)),
+    (chained(RIGHT, times(STEPS, 1000)), r"joints .*'to_upper'.* up to 400 m from .*beside links .*in millimeters"),
+    (chained(RIGHT, times(STEPS, 1000, 1)), r"joint 'to_upper' is up to 400 m from the parent"),
+    (chained(RIGHT, slide="0 85"), r"joint 'grip' slides from 0 to 85 m, .* in millimeters; write 0 to 0\.085"),
+    (chained(RIGHT, slide="-40 0"), r"joint 'grip' slides from -40 to 0 m, .*write -0\.04 to 0"),
+    (chained(times(RIGHT, 0.001), mesh="unit.stl").replace("0.02 0.02 0.08", "0.00002 0.00002 0.00008"),
+     r"all links are at most 0\.\d+ mm large.*multiply it by 1000"),
 )  # fmt: skip
 def test_links_joints_and_slides_in_another_unit_are_told(tmp_path, content, words):
     trimesh.creation.box(extents=(0.3, 0.3, 1)).export(tmp_path / "unit.stl")
@@ -179,26 +155,16 @@ def test_links_joints_and_slides_in_another_unit_are_told(tmp_path, content, wor
     assert len(caught) == 1
 
 
-def test_geometry_that_is_scaled_twice_is_told(tmp_path):
-    trimesh.creation.box(extents=(0.3, 0.3, 1)).export(tmp_path / "unit.stl")
-    text = chained(times(RIGHT, 0.001), mesh="unit.stl").replace("0.02 0.02 0.08", "0.00002 0.00002 0.00008")
-    with pytest.warns(UnitsWarning, match=r"all links are at most 0\.\d+ mm large.*multiply it by 1000"):
-        load_urdf(saved(tmp_path, text))
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        chained(RIGHT),
-        chained(times(RIGHT, 40), times(STEPS, 40), slide="0 12"),  # a crane
-        chained((8.0, 0.5, 0.5, 0.4), (3.0, 0.4, 0.3), slide="0 12"),  # a gantry on its rail
-        chained((0.3, 0.01, 0.01, 0.01)),  # markers at joints
-        robot(link("base", "<box size='30 30 0.01'/>"), link("tip"), joint("tip")),  # on the ground
-        # Free in the world: a platform on two slides without geometry.
-        robot("<link name='world'/><link name='x'/>", link("base"), joint("base", "prismatic", "<limit lower='-50' "
-              "upper='50'/>", "x"), joint("x", "prismatic", "<limit lower='-50' upper='50'/>", "world")),
-        chained(RIGHT, slide="-3 3"),
-    ],
+@each(
+    chained(RIGHT),
+    chained(times(RIGHT, 40), times(STEPS, 40), slide="0 12"),  # a crane
+    chained((8.0, 0.5, 0.5, 0.4), (3.0, 0.4, 0.3), slide="0 12"),  # a gantry on its rail
+    chained((0.3, 0.01, 0.01, 0.01)),  # markers at joints
+    robot(link("base", "<box size='30 30 0.01'/>"), link("tip"), joint("tip")),  # on the ground
+    # Free in the world: a platform on two slides without geometry.
+    robot("<link name='world'/><link name='x'/>", link("base"), joint("base", "prismatic", "<limit lower='-50' "
+          "upper='50'/>", "x"), joint("x", "prismatic", "<limit lower='-50' upper='50'/>", "world")),
+    chained(RIGHT, slide="-3 3"),
 )  # fmt: skip
 def test_large_robots_and_free_ones_are_as_they_are(tmp_path, content):
     load_urdf(saved(tmp_path, content))  # warnings are errors in tests

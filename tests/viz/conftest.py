@@ -1,94 +1,16 @@
-"""Small results of every kind, made without running a pipeline, and a viewer of files."""
+"""Small results of every kind, made without running a pipeline."""
 
 import numpy as np
-import pygltflib
 import pytest
 import torch
 import trimesh
 from PIL import Image
-from scipy.spatial.transform import Rotation, Slerp
 
 import torchreg as tr
+from tests.gltf_player import Player
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
-_DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 DOUBLE = {"dtype": torch.float64}
-
-
-class GltfViewer:
-    """Evaluates a file as the specification says: tracks, hierarchy, inverse bind matrices, skin, moved shapes."""
-
-    def __init__(self, path):
-        self.gltf = pygltflib.GLTF2().load(str(path))
-        self.blob = self.gltf.binary_blob()
-
-    def read(self, index):
-        accessor = self.gltf.accessors[index]
-        start, width = self.gltf.bufferViews[accessor.bufferView].byteOffset, _WIDTHS[accessor.type]
-        values = np.frombuffer(self.blob, _DTYPES[accessor.componentType], accessor.count * width, start)
-        return values.reshape(-1, width)
-
-    def seconds(self):
-        return self.read(self.gltf.animations[0].samplers[0].input)[:, 0]
-
-    def attribute(self, name):
-        index = getattr(self.gltf.meshes[0].primitives[0].attributes, name, None)
-        return None if index is None else self.read(index)
-
-    def joint_names(self):
-        return [self.gltf.nodes[node].name for node in self.gltf.skins[0].joints]
-
-    def vertices(self, frame):
-        return self.at(float(self.seconds()[frame]))
-
-    def at(self, time):
-        """Return the vertices (V, 3) at a time, in seconds."""
-        if not self.gltf.skins:
-            return self.morphed(time)
-        world, skin = self.placed(time), self.gltf.skins[0]
-        inverse = self.read(skin.inverseBindMatrices).astype(float).reshape(-1, 4, 4).transpose(0, 2, 1)
-        joints = np.stack([world[node] @ bind for node, bind in zip(skin.joints, inverse, strict=True)])
-        points = np.c_[self.attribute("POSITION").astype(float), np.ones(len(self.attribute("POSITION")))]
-        total = np.zeros_like(points)
-        for number in "01":
-            if (index := self.attribute(f"JOINTS_{number}")) is not None:
-                moved = np.einsum("vsij,vj->vsi", joints[index], points)
-                total += np.einsum("vs,vsi->vi", self.attribute(f"WEIGHTS_{number}"), moved)
-        return total[:, :3]
-
-    def placed(self, time):
-        """Return the transforms of the nodes in the world."""
-        local = [np.eye(4) for _ in self.gltf.nodes]
-        for matrix, node in zip(local, self.gltf.nodes, strict=True):
-            matrix[:3, :3] = Rotation.from_quat(node.rotation or (0, 0, 0, 1)).as_matrix()
-            matrix[:3, 3] = node.translation or (0, 0, 0)
-        for channel in self.gltf.animations[0].channels:
-            sampler = self.gltf.animations[0].samplers[channel.sampler]
-            keys, values = self.read(sampler.input)[:, 0].astype(float), self.read(sampler.output).astype(float)
-            at, matrix = float(np.clip(time, keys[0], keys[-1])), local[channel.target.node]
-            if channel.target.path == "translation":
-                matrix[:3, 3] = [np.interp(at, keys, row) for row in values.T]
-            else:
-                matrix[:3, :3] = Slerp(keys, Rotation.from_quat(values))(at).as_matrix()
-        world = {}
-
-        def visit(node, above):
-            world[node] = above @ local[node]
-            for child in self.gltf.nodes[node].children:
-                visit(child, world[node])
-
-        for root in self.gltf.scenes[0].nodes:
-            visit(root, np.eye(4))
-        return world
-
-    def morphed(self, time):
-        primitive, (sampler,) = self.gltf.meshes[0].primitives[0], self.gltf.animations[0].samplers
-        keys = self.read(sampler.input)[:, 0]
-        shares = self.read(sampler.output).reshape(len(keys), -1)
-        targets = zip(shares.T, primitive.targets, strict=True)
-        moves = [np.interp(time, keys, row) * self.read(target["POSITION"]) for row, target in targets]
-        return self.read(primitive.attributes.POSITION) + sum(moves)
 
 
 def _ball(level, dtype=torch.float32):
@@ -152,7 +74,7 @@ def tools():
     """Return the functions that make small bodies, motions and models, and those that read files."""
     return type("Tools", (), {
         "ball": staticmethod(_ball), "motion": staticmethod(_motion), "bar_model": staticmethod(_bar_model),
-        "bones_scene": staticmethod(_bones_scene), "play": GltfViewer, "pictures_of": staticmethod(_pictures_of),
+        "bones_scene": staticmethod(_bones_scene), "play": Player, "pictures_of": staticmethod(_pictures_of),
     })  # fmt: skip
 
 

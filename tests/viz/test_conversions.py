@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.tables import refused
 from torchreg.viz import bone_colors
 
 to_open3d, to_pyvista, to_trimesh = tr.to_open3d, tr.to_pyvista, tr.to_trimesh
@@ -82,16 +83,15 @@ def test_curves(stand_ins, spine):
 
 
 def test_what_does_not_fit_is_refused(monkeypatch, sequence, spine):
-    with pytest.raises(tr.errors.InputError, match="frame must be from 0 to 1, got 2"):
-        to_trimesh(sequence, 2)
-    with pytest.raises(tr.errors.InputError, match="frame must be from 0 to 2"):
-        to_trimesh(spine, -1)
-    with pytest.raises(tr.errors.InputTypeError, match="got str"):
-        to_trimesh("mesh.ply")
+    refused(
+        (lambda: to_trimesh(sequence, 2), "frame must be from 0 to 1, got 2"),
+        (lambda: to_trimesh(spine, -1), "frame must be from 0 to 2"), error=tr.errors.InputError,
+    )  # fmt: skip
+    refused((lambda: to_trimesh("mesh.ply"), "got str"), error=tr.errors.InputTypeError)
     for name, convert in (("open3d", to_open3d), ("pyvista", to_pyvista)):
         monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(tr.errors.MissingExtraError, match=rf"pip install 'torchreg-articulated\[{name}\]'"):
-            convert(BALL)
+        words = rf"pip install 'torchreg-articulated\[{name}\]'"
+        refused((lambda convert=convert: convert(BALL), words), error=tr.errors.MissingExtraError)
 
 
 @pytest.mark.parametrize(("name", "convert"), [("open3d", to_open3d), ("pyvista", to_pyvista)])

@@ -6,6 +6,7 @@ import torch
 import trimesh
 
 import torchreg as tr
+from tests.tables import each_row
 from torchreg.viz import gltf, scan_gltf, spine_gltf, tracking
 from torchreg.viz import scene as sc
 
@@ -62,15 +63,10 @@ def test_links_of_a_robot_are_nodes_in_their_colors(tmp_path):
     assert len(scene.geometry["upper"].vertices) == 24  # a box, with the normals of its sides
 
 
-@pytest.mark.parametrize(
-    ("hierarchy", "dtype", "scale"),
-    [
-        ("tree", torch.float32, 1e-3),
-        ("flat", torch.float64, 1e3),
-        ("tree", torch.float64, 1.0),
-        ("flat", torch.float32, 1.0),
-    ],
-)
+@each_row(
+    ("tree", torch.float32, 1e-3), ("flat", torch.float64, 1e3), ("tree", torch.float64, 1.0),
+    ("flat", torch.float32, 1.0),
+)  # fmt: skip
 def test_both_poses_are_those_of_the_model(tools, tmp_path, hierarchy, dtype, scale):
     model, points, faces = tools.bones_scene(bones=4, scale=scale, dtype=dtype)
     written = SCAN(tmp_path / "scan.glb", model, points, faces, hierarchy=hierarchy)
@@ -131,7 +127,7 @@ def test_joints_of_spines_lie_on_the_curves_in_every_frame(tools, spine, tmp_pat
     viewer = tools.play(SPINE(tmp_path / "a.glb", spine.model, num_joints=8, fps=10.0))
     animation = viewer.gltf.animations[0]
     moves = [channel for channel in animation.channels if channel.target.path == "translation"]
-    places = np.stack([viewer.read(animation.samplers[channel.sampler].output) for channel in moves], 1)
+    places = np.stack([viewer.accessor(animation.samplers[channel.sampler].output) for channel in moves], 1)
     np.testing.assert_allclose(places, spine.curves.flatten(1, 2), atol=1e-6)
     np.testing.assert_allclose(viewer.seconds(), [0.0, 0.1, 0.2], atol=1e-6)
     assert viewer.gltf.nodes[moves[0].target.node].name == "limb_0_0"
@@ -180,28 +176,25 @@ def test_a_scene_is_written_in_the_frames_in_which_its_joints_were_found(tools, 
 PLAIN = sc.Scene("a", (sc.MovingMesh("plain", torch.eye(3), torch.arange(3)[None]),))
 
 
-@pytest.mark.parametrize(
-    ("save", "change", "message"),
-    [
-        (SHAPE, {"times": torch.arange(2.0)}, r"times must have shape \(3\), got \(2,\)"),
-        (SHAPE, {"poses": torch.zeros(27)}, r"poses must have shape \(T, 27\)"),
-        (SHAPE, {"poses": torch.full((3, 27), torch.nan)}, "the shape was never found"),
-        (SHAPE, {"path": "a.gif"}, r"path must end in \.glb"),
-        (SHAPE, {"fps": -1.0}, "fps must be positive"),
-        (SHAPE, {"skin": None}, "skin must have faces"),
-        (SCAN, {"hierarchy": "ring"}, "hierarchy must be one of"),
-        (SCAN, {"most_weights": 5}, "most_weights must be 4 or 8"),
-        (SCAN, {"points": torch.zeros(0, 3)}, "points must hold at least 1"),
-        (SCAN, {"poses": torch.eye(4)}, "poses must have shape"),
-        (SCAN, {"poses": torch.zeros(0, 6, 4, 4)}, "poses must hold at least one"),
-        (SCAN, {"poses": 2 * torch.eye(4).repeat(1, 6, 1, 1)}, "poses must hold rigid motions"),
-        (SCAN, {"times": torch.zeros(3)}, "times must have shape"),
-        (SCAN, {"path": "a.gltf"}, r"path must end in \.glb"),
-        (SPINE, {"path": "a.gltf"}, r"must end in \.glb"),
-        (SPINE, {"frame": 3}, "frame must be from 0 to 2"),
-        (SPINE, {"num_joints": 1}, "num_joints must be at least 2"),
-        (SCENE, {"scene": PLAIN}, "joints move, but has plain"),
-    ],
+@each_row(
+    (SHAPE, {"times": torch.arange(2.0)}, r"times must have shape \(3\), got \(2,\)"),
+    (SHAPE, {"poses": torch.zeros(27)}, r"poses must have shape \(T, 27\)"),
+    (SHAPE, {"poses": torch.full((3, 27), torch.nan)}, "the shape was never found"),
+    (SHAPE, {"path": "a.gif"}, r"path must end in \.glb"),
+    (SHAPE, {"fps": -1.0}, "fps must be positive"),
+    (SHAPE, {"skin": None}, "skin must have faces"),
+    (SCAN, {"hierarchy": "ring"}, "hierarchy must be one of"),
+    (SCAN, {"most_weights": 5}, "most_weights must be 4 or 8"),
+    (SCAN, {"points": torch.zeros(0, 3)}, "points must hold at least 1"),
+    (SCAN, {"poses": torch.eye(4)}, "poses must have shape"),
+    (SCAN, {"poses": torch.zeros(0, 6, 4, 4)}, "poses must hold at least one"),
+    (SCAN, {"poses": 2 * torch.eye(4).repeat(1, 6, 1, 1)}, "poses must hold rigid motions"),
+    (SCAN, {"times": torch.zeros(3)}, "times must have shape"),
+    (SCAN, {"path": "a.gltf"}, r"path must end in \.glb"),
+    (SPINE, {"path": "a.gltf"}, r"must end in \.glb"),
+    (SPINE, {"frame": 3}, "frame must be from 0 to 2"),
+    (SPINE, {"num_joints": 1}, "num_joints must be at least 2"),
+    (SCENE, {"scene": PLAIN}, "joints move, but has plain"),
 )
 def test_bad_arguments_are_refused(tools, plain_hand, plain_hand_skin, coarse, spine, tmp_path, save, change, message):
     usual = {

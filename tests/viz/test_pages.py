@@ -19,6 +19,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 import torchreg as tr
+from tests.tables import each
 from torchreg.viz import live_track, rerun_log, viewer
 from torchreg.viz import scene as sc
 from torchreg.viz.result_scenes import result_scene
@@ -27,12 +28,9 @@ Cloud, Curves, Meshes, MovingMesh, Scene = sc.Cloud, sc.Curves, sc.Meshes, sc.Mo
 InputError, MissingExtraError, SceneViewer = tr.errors.InputError, tr.errors.MissingExtraError, viewer.SceneViewer
 HOST, SOON = "127.0.0.1", torch.tensor([0.0, 0.02])
 UPGRADE = {
-    "Upgrade": "websocket",
-    "Connection": "Upgrade",
-    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
-    "Sec-WebSocket-Version": "13",
-    "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
-}
+    "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec-WebSocket-Version": "13", "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +50,8 @@ def node(page, name):
     return page.server.scene.get_handle_by_name(name)
 
 
-@pytest.mark.parametrize(
-    "name", ["alignment", "track", "demo", "starts", "calibration", "registration", "sequence", "spine"]
-)
-def test_every_kind_of_result_opens_here_alone(request, name, hand, capsys):
+@each("alignment", "track", "demo", "starts", "calibration", "registration", "sequence", "spine")
+def test_every_kind_of_result_opens_here_alone(request, hand, capsys, name):
     scene = result_scene(request.getfixturevalue(name), shape=hand if name in {"track", "starts"} else None)
     with SceneViewer(scene, port=0) as page:
         assert page.url.startswith(f"http://{HOST}:")
@@ -274,13 +270,10 @@ def test_the_printed_address_is_the_only_one_that_lets_in(status):
     assert websocket_server.serve.__module__.startswith("websockets")
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        *({"Origin": origin} for origin in ("null", "http://evil.example", "https://127.0.0.1:{port}")),
-        *({"Origin": origin} for origin in ("http://127.0.0.1", "file://", "http://127.0.0.1:1")),
-        *({"Host": host} for host in ("evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1.evil.io:{port}")),
-    ],
+@each(
+    *({"Origin": origin} for origin in ("null", "http://evil.example", "https://127.0.0.1:{port}")),
+    *({"Origin": origin} for origin in ("http://127.0.0.1", "file://", "http://127.0.0.1:1")),
+    *({"Host": host} for host in ("evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1.evil.io:{port}")),
 )
 def test_other_origins_and_hosts_are_refused_even_with_the_token(status, header):
     header = {name: text.format(port=status.port) for name, text in header.items()}

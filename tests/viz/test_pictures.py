@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 import torchreg as tr
+from tests.tables import each_row, refused, refusing
 from torchreg.viz import animation, figures, spines, tracking
 from torchreg.viz import scene as sc
 from torchreg.viz.result_scenes import result_scene
@@ -166,14 +167,13 @@ def test_pictures_of_the_documentation_show_a_finger_per_sharpness(tmp_path):
     assert dull > 2 * sharp > 0
     figure, _ = figures.new_figure(20, 20)
     assert png_size(figures.save_picture(figure, tmp_path / "a.png", dpi=200)) == (40, 40)
-    for error, words, call in (
-        (InputError, "sharpness must hold at least one", lambda: figures.bending_picture(path, ())),
-        (InputError, "sharpness must be positive", lambda: figures.bending_picture(path, (-1.0,))),
-        (InputError, r"\.pdf or \.svg, got 'a\.x'", lambda: figures.save_picture(figure, tmp_path / "a.x")),
-        (FileNotFoundError, "does not exist", lambda: figures.save_picture(figure, tmp_path / "none" / "a.png")),
-    ):  # fmt: skip
-        with pytest.raises(error, match=words):
-            call()
+    refused(
+        (lambda: figures.bending_picture(path, ()), "sharpness must hold at least one"),
+        (lambda: figures.bending_picture(path, (-1.0,)), "sharpness must be positive"),
+        (lambda: figures.save_picture(figure, tmp_path / "a.x"), r"\.pdf or \.svg, got 'a\.x'"),
+        error=InputError,
+    )
+    refused((lambda: figures.save_picture(figure, tmp_path / "none/a.png"), "does not exist"), error=FileNotFoundError)
 
 
 @pytest.mark.parametrize("frames", [1, 3])
@@ -261,21 +261,18 @@ def test_an_interruption_leaves_the_frames_so_far_and_a_failing_frame_no_file(to
     assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
 
 
-@pytest.mark.parametrize(
-    ("frames", "name", "fps", "message"),
-    [
-        ([], "a.gif", 20, "frames must hold at least one frame"),
-        ([plain(0)], "a.avi", 20, r"path must end in \.gif or \.mp4, got 'a\.avi'"),
-        ([plain(0)], "none/a.gif", 20, "does not exist"),
-        ([plain(0)], "a.gif", 0.0, "fps must be positive"),
-        ([np.zeros((4, 4))], "a.gif", 20, r"frames\[0\] must have shape \(H, W, 3\)"),
-        ([np.full((4, 4, 3), 7.0)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
-        ([np.full((4, 4, 3), np.nan)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
-    ],
+test_animations_that_are_refused = refusing(
+    lambda folder, frames, name, fps: animation.save_animation(folder / name, frames, fps),
+    (InputError, FileNotFoundError),
+)(
+    ([], "a.gif", 20, "frames must hold at least one frame"),
+    ([plain(0)], "a.avi", 20, r"path must end in \.gif or \.mp4, got 'a\.avi'"),
+    ([plain(0)], "none/a.gif", 20, "does not exist"),
+    ([plain(0)], "a.gif", 0.0, "fps must be positive"),
+    ([np.zeros((4, 4))], "a.gif", 20, r"frames\[0\] must have shape \(H, W, 3\)"),
+    ([np.full((4, 4, 3), 7.0)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
+    ([np.full((4, 4, 3), np.nan)], "a.gif", 20, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
 )
-def test_save_animation_refuses(tmp_path, frames, name, fps, message):
-    with pytest.raises((InputError, FileNotFoundError), match=message):
-        animation.save_animation(tmp_path / name, frames, fps)
 
 
 @pytest.fixture
@@ -379,13 +376,10 @@ def test_surfaces_without_data_are_gray_and_data_are_blue_or_gray(drawing, track
     assert np.abs(drawing(captions=["12  lost"])[corner] - usual[corner]).max() > 100
 
 
-@pytest.mark.parametrize(
-    ("arguments", "label"),
-    [
-        ((3, tr.Status.CONVERGED, "tracked"), "frame 3: tracked"),
-        ((0, tr.Status.MAX_STEPS, "found"), "frame 0: found"),
-        ((12, tr.Status.NO_DATA, "held"), "frame 12: no_data"),
-    ],
+@each_row(
+    ((3, tr.Status.CONVERGED, "tracked"), "frame 3: tracked"),
+    ((0, tr.Status.MAX_STEPS, "found"), "frame 0: found"),
+    ((12, tr.Status.NO_DATA, "held"), "frame 12: no_data"),
 )
 def test_labels_name_the_source_of_a_pose_or_the_reason_for_none(arguments, label):
     assert tracking.frame_label(*arguments) == label
@@ -456,17 +450,14 @@ def test_a_track_plays_with_the_inliers_of_the_tracker(tools, plain_hand, coarse
         tracking.save_track_gltf(tmp_path / "a.glb", plain_hand, lost, skin=coarse)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"frames": slice(3)}, r"result\.poses must have shape \(3, 27\), got \(4, 27\)"),
-        ({"inliers": [torch.ones(3) > 0]}, r"inliers must hold one entry per pose \(4\), got 1"),
-        ({"inliers": [torch.ones(3) > 0] * 4}, "inliers must have shape"),
-        ({"inliers": [torch.ones(300)] * 4}, "inliers must"),
-        ({"frames": slice(0), "poses": slice(0)}, "frames must hold at least one cloud"),
-        ({"inlier_distance": 0.0}, "inlier_distance must be positive"),
-        ({"path": "a.png"}, "path must end in"),
-    ],
+@each_row(
+    ({"frames": slice(3)}, r"result\.poses must have shape \(3, 27\), got \(4, 27\)"),
+    ({"inliers": [torch.ones(3) > 0]}, r"inliers must hold one entry per pose \(4\), got 1"),
+    ({"inliers": [torch.ones(3) > 0] * 4}, "inliers must have shape"),
+    ({"inliers": [torch.ones(300)] * 4}, "inliers must"),
+    ({"frames": slice(0), "poses": slice(0)}, "frames must hold at least one cloud"),
+    ({"inlier_distance": 0.0}, "inlier_distance must be positive"),
+    ({"path": "a.png"}, "path must end in"),
 )
 def test_animate_track_refuses(plain_hand, coarse, tracked, tmp_path, options, message):
     frames, _, result = tracked

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.tables import each_row
 from torchreg.viz import picking, pose_app, pose_editor
 
 InputError, PoseEditor = tr.errors.InputError, pose_editor.PoseEditor
@@ -170,18 +171,15 @@ def test_blends_that_gltf_lacks_are_written_vertex_by_vertex(registration, tmp_p
     np.testing.assert_allclose(tr.load_points(path).points, torch.stack((x, z, -y), -1), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda e: e.add_handle(-1), "vertex must be from 0"),
-        (lambda e: e.drag({1: torch.zeros(3)}), "one of 1 handles, got 1"),
-        (lambda e: e.drag({0: torch.full((3,), torch.nan)}), "targets"),
-        (lambda e: e.pin(1), "one of 1 handles"),
-        (lambda e: e.remove_handle(4), "one of 1 handles"),
-        (lambda e: PoseEditor(replace(e.result, faces=None)).save_gltf("cloud.glb"), "export PLY"),
-        (lambda e: PoseEditor(e.result, start=torch.eye(4).expand(2, 4, 4)), "start must have shape"),
-        (lambda e: PoseEditor(e.sequence, frame=2), "frame must be from 0 to 1"),
-    ],
+@each_row(
+    (lambda e: e.add_handle(-1), "vertex must be from 0"),
+    (lambda e: e.drag({1: torch.zeros(3)}), "one of 1 handles, got 1"),
+    (lambda e: e.drag({0: torch.full((3,), torch.nan)}), "targets"),
+    (lambda e: e.pin(1), "one of 1 handles"),
+    (lambda e: e.remove_handle(4), "one of 1 handles"),
+    (lambda e: PoseEditor(replace(e.result, faces=None)).save_gltf("cloud.glb"), "export PLY"),
+    (lambda e: PoseEditor(e.result, start=torch.eye(4).expand(2, 4, 4)), "start must have shape"),
+    (lambda e: PoseEditor(e.sequence, frame=2), "frame must be from 0 to 1"),
 )
 def test_bad_arguments_are_refused(posed, registration, sequence, call, words):
     posed.result, posed.sequence = registration, sequence

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.tables import each_row, refused, refusing
 from torchreg.viz import bone_colors
 from torchreg.viz import scene as sc
 from torchreg.viz.result_scenes import result_scene
@@ -103,16 +104,13 @@ def test_sequences_of_scans_and_spines_show_every_frame(sequence, spine, ball):
     assert names(result_scene(spine)) == ["limbs"]
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "words"),
-    [
-        ("alignment", {"data": [POINTS, POINTS]}, "one cloud per frame"),
-        ("alignment", {"data": [POINTS]}, r"result\.inliers"),
-        ("starts", {}, "shape must be given"),
-        ("spine", {"data": [POINTS]}, "one surface per frame"),
-        ("spine", {"shape": True}, "shape has no meaning for a SpineSequence"),
-        ("registration", {"shape": True}, "shape has no meaning for a ScanRegistration"),
-    ],
+@each_row(
+    ("alignment", {"data": [POINTS, POINTS]}, "one cloud per frame"),
+    ("alignment", {"data": [POINTS]}, r"result\.inliers"),
+    ("starts", {}, "shape must be given"),
+    ("spine", {"data": [POINTS]}, "one surface per frame"),
+    ("spine", {"shape": True}, "shape has no meaning for a SpineSequence"),
+    ("registration", {"shape": True}, "shape has no meaning for a ScanRegistration"),
 )
 def test_results_without_a_scene_are_refused(request, hand, name, settings, words):
     if "shape" in settings:
@@ -190,23 +188,17 @@ def test_outliers_do_not_decide_where_the_camera_stands(ball):
 BLACK, FACES = (0.0, 0.0, 0.0), torch.arange(18).reshape(6, 3)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda one: MovingMesh("ball", POINTS, FACES, POINTS[:3]), "paint of ball"),
-        (lambda one: Cloud("data", [POINTS[:, :2]], BLACK), r"frames\[0\] of data"),
-        (lambda one: Cloud("data", [POINTS], [POINTS, POINTS]), "paints of data must be 1"),
-        (lambda one: Cloud("data", [POINTS], [POINTS[:3]]), r"paints\[0\] of data"),
-        (lambda one: Curves("limbs", torch.zeros(1, 2, 3), torch.zeros(1, 3), labels=("a", "b")), "labels of limbs"),
-        (lambda one: Scene("twice", (one, one)), "different names"),
-        (lambda one: Scene("empty", ()), "got none"),
-        (lambda one: Scene("a", (Cloud("b", [POINTS] * 2, BLACK), Cloud("c", [POINTS] * 3, BLACK))), "got 2, 3"),
-        (lambda one: Scene("late", (one,), torch.arange(2.0)), "times"),
-    ],
+test_layers_that_do_not_fit = refusing(lambda _, make: make(MovingMesh("ball", POINTS, FACES)), InputError)(
+    (lambda one: MovingMesh("ball", POINTS, FACES, POINTS[:3]), "paint of ball"),
+    (lambda one: Cloud("data", [POINTS[:, :2]], BLACK), r"frames\[0\] of data"),
+    (lambda one: Cloud("data", [POINTS], [POINTS, POINTS]), "paints of data must be 1"),
+    (lambda one: Cloud("data", [POINTS], [POINTS[:3]]), r"paints\[0\] of data"),
+    (lambda one: Curves("limbs", torch.zeros(1, 2, 3), torch.zeros(1, 3), labels=("a", "b")), "labels of limbs"),
+    (lambda one: Scene("twice", (one, one)), "different names"),
+    (lambda one: Scene("empty", ()), "got none"),
+    (lambda one: Scene("a", (Cloud("b", [POINTS] * 2, BLACK), Cloud("c", [POINTS] * 3, BLACK))), "got 2, 3"),
+    (lambda one: Scene("late", (one,), torch.arange(2.0)), "times"),
 )
-def test_layers_that_do_not_fit_are_refused(make, words):
-    with pytest.raises(InputError, match=words):
-        make(MovingMesh("ball", POINTS, FACES))
 
 
 def test_colors_of_bones_are_distinct_and_mixed_by_weights():
@@ -255,12 +247,11 @@ def test_colors_are_written(tools, tmp_path):
     bone_colors.save_error_ply(tmp_path / "e.ply", points, torch.zeros(len(points)), largest=0.1)
     assert tr.load_points(tmp_path / "e.ply").faces is None
     bone_colors.save_error_ply(tmp_path / "e.ply", points, torch.full((len(points),), math.nan))
-    for words, call in {
-        "the model holds several poses": lambda: bone_colors.save_weight_ply("w.ply", several, points, moved=True),
-        r"path must end in .ply": lambda: bone_colors.save_weight_ply("w.xyz", model, points),
-        "errors must have shape": lambda: bone_colors.save_error_ply("e.ply", points, errors[:3]),
-        "errors must not be negative": lambda: bone_colors.save_error_ply("e.ply", points, -1 - errors),
-        "largest must be zero": lambda: bone_colors.save_error_ply("e.ply", points, errors, largest=-1.0),
-    }.items():
-        with pytest.raises(InputError, match=words):
-            call()
+    refused(
+        (lambda: bone_colors.save_weight_ply("w.ply", several, points, moved=True), "the model holds several poses"),
+        (lambda: bone_colors.save_weight_ply("w.xyz", model, points), r"path must end in .ply"),
+        (lambda: bone_colors.save_error_ply("e.ply", points, errors[:3]), "errors must have shape"),
+        (lambda: bone_colors.save_error_ply("e.ply", points, -1 - errors), "errors must not be negative"),
+        (lambda: bone_colors.save_error_ply("e.ply", points, errors, largest=-1.0), "largest must be zero"),
+        error=InputError,
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import torchreg as tr
+from tests.viz.conftest import spine, tools  # noqa: F401
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 
@@ -73,3 +74,12 @@ def toy_pair():
 @pytest.fixture(scope="session")
 def registered_toy(toy_pair):
     return tr.register(toy_pair.source, toy_pair.target, 8, 40, start=toy_pair.truth)
+
+
+@pytest.fixture
+def app(registered_toy, tmp_path):
+    from torchreg.viz.pose_app import PoseApp
+    from torchreg.viz.pose_editor import PoseEditor
+
+    with PoseApp(PoseEditor(registered_toy), output=tmp_path / "posed", port=0) as app:
+        yield app

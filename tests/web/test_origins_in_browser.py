@@ -10,9 +10,6 @@ pytest.importorskip("viser", reason="the viewer needs viser")
 
 import viser
 
-from torchreg.viz.pose_app import PoseApp
-from torchreg.viz.pose_editor import PoseEditor
-
 # Tries to connect as the app's own page does, and tells how that ended; then whether it can read the page.
 ATTACK = """
 async ([address, page, protocol]) => {
@@ -25,12 +22,6 @@ async ([address, page, protocol]) => {
   return [ended, read];
 }
 """
-
-
-@pytest.fixture
-def app(registered_toy, tmp_path):
-    with PoseApp(PoseEditor(registered_toy), output=tmp_path / "posed", port=0) as app:
-        yield app
 
 
 @pytest.fixture

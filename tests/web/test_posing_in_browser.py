@@ -3,11 +3,7 @@
 import time
 
 import numpy as np
-import pytest
 import torch
-
-from torchreg.viz.pose_app import PoseApp
-from torchreg.viz.pose_editor import PoseEditor
 
 MOVES = 30
 # One picture of a page at 30 per second.
@@ -37,12 +33,6 @@ class Screen:
     def project(self, points):
         local = (np.asarray(points) - self._position) @ self._rotation
         return self._middle + self._focal * local[..., :2] / local[..., 2:]
-
-
-@pytest.fixture
-def app(registered_toy, tmp_path):
-    with PoseApp(PoseEditor(registered_toy), output=tmp_path / "posed", port=0) as app:
-        yield app
 
 
 def click_visible_point(app, page, screen):

@@ -5,7 +5,6 @@ import io
 import numpy as np
 import pytest
 import torch
-import trimesh
 from PIL import Image
 
 import torchreg as tr
@@ -28,22 +27,9 @@ def track_scene():
     return result_scene(track, shape=hand, data=list(track.keypoints + 0.002))
 
 
-def ball(level):
-    mesh = trimesh.creation.icosphere(level)
-    return tr.TriangleMesh(torch.tensor(mesh.vertices.tolist()), torch.tensor(mesh.faces.tolist()))
-
-
-def spine_scene():
-    line = torch.linspace(1, 0, 8).unsqueeze(-1)
-    still = line * torch.tensor([[1.0, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0]]).unsqueeze(1)
-    curves = torch.stack([still, still + torch.tensor([0.0, 0, 0.3])])
-    graph, radii = torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.full((2, 3, 8), 0.1)
-    frames, yes = torch.eye(3).expand(2, 3, 8, 3, 3), torch.ones(2, 3, dtype=torch.bool)
-    spine = tr.SpineSequence(
-        tr.Spine(curves, graph, radii), graph, curves, radii, frames, torch.arange(2.0), yes, yes, 0, ("(()()())",) * 2,
-        ("(()()())",) * 2, (tr.Status.CONVERGED,) * 2, tr.Status.CONVERGED, (),
-    )  # fmt: skip
-    return result_scene(spine, data=[ball(2), ball(3)])
+@pytest.fixture
+def spine_scene(spine, tools):
+    return result_scene(spine, data=[tools.ball(2), tools.ball(3), tools.ball(3)])
 
 
 def drawn(page):
@@ -81,7 +67,7 @@ def test_a_result_opens_and_plays(kind, request, record, pictures):
         pair = request.getfixturevalue("toy_pair")
         scene = result_scene(request.getfixturevalue("registered_toy"), data=[pair.target.points])
     else:
-        scene = {"track": track_scene, "spine": spine_scene}[kind]()
+        scene = track_scene() if kind == "track" else request.getfixturevalue("spine_scene")
     with SceneViewer(scene, port=0) as viewer:
         page = record.page
         page.goto(viewer.url)
@@ -96,8 +82,8 @@ def test_a_result_opens_and_plays(kind, request, record, pictures):
         assert record.problems(viewer.url) == []
 
 
-def test_one_file_opens_without_a_server(record, tmp_path, pictures):
-    scene = spine_scene()
+def test_one_file_opens_without_a_server(spine_scene, record, tmp_path, pictures):
+    scene = spine_scene
     # Long frames: without a graphics card, playing it over and over takes all of the processor.
     path = scene_html(tmp_path / "spine.html", Scene(scene.title, scene.layers, torch.tensor([0.0, 600.0])))
     url = path.as_uri()

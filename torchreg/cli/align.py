@@ -29,7 +29,7 @@ from torchreg.cli.cameras import DepthOptions, check_used
 from torchreg.cli.export import Old, check_old
 from torchreg.cli.hand_side import Side, better_hand, shape_of_side
 from torchreg.cli.known_options import Initializer, Known, KnownOptions, observability, read_initializer
-from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
+from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import Shape, ShapeOptions, chosen_skin
 from torchreg.cli.upright import Up, Upright, known_up, remembering
@@ -59,9 +59,7 @@ def align(
             "taken for the frames of a motion, and each starts from the pose before. With --depth depth pictures.",
         ),
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written.")
-    ] = Path("result"),
+    output: Annotated[Path, written_to("RESULT", "RESULT.safetensors and RESULT.json are written.")] = Path("result"),
     *,
     start: Annotated[
         Path | None,

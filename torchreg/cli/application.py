@@ -28,11 +28,7 @@ from torchreg.cli.view import view
 from torchreg.cli.writers import endings_help
 
 app = typer.Typer(
-    name="torchreg",
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-    no_args_is_help=True,
+    name="torchreg", rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False, no_args_is_help=True
 )
 
 

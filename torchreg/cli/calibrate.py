@@ -13,7 +13,7 @@ import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
 from torchreg.cli.cameras import DepthOptions, Seen, check_used, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.shape_argument import PackageDir, Shape, ShapeOptions
 from torchreg.cli.writers import Source, write_optional
@@ -48,12 +48,9 @@ def calibrate(
             help="Joints of a robot, a row for each of FRAMES: a line of names, then radians, metres.",
         ),
     ] = None,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written, and more."
-        ),
-    ] = Path("calibration"),
+    output: Annotated[Path, written_to("RESULT", "RESULT.safetensors and RESULT.json are written, and more.")] = Path(
+        "calibration"
+    ),
     *,
     views: DepthOptions,
     offsets: Annotated[bool, typer.Option("--offsets", help="Look for constant offsets of the joints, too.")] = False,
@@ -64,8 +61,7 @@ def calibrate(
         ),
     ] = None,
     urdf_out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.urdf", help="The robot with a link camera, axes right, down, forward."),
+        Path | None, typer.Option(metavar="FILE.urdf", help="The robot with a link camera, axes right, down, forward.")
     ] = None,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -79,9 +75,9 @@ def calibrate(
     Of a robot RESULT_transform.json holds the base, what is known of it and ROS's static transform,
     RESULT_handeye.yaml the camera as easy_handeye and MoveIt read it, and RESULT_seen a picture of the robot over each
     frame. Joints whose names are those of the robot's file are read; offsets of joints
-    that the frames do not tell stay zero.
+    that the frames do not determine stay zero.
 
-    A hand is searched in every cloud. Clouds in which it is not surely found are told and left out.
+    A hand is searched in every cloud. Clouds in which it is not surely found are named and left out.
 
     Exit codes: 0; 1 if no frame shows the robot, hardly any the hand, or an output beside the result could not be
     written; 2 for an error; 130 for Ctrl-C.
@@ -168,7 +164,7 @@ def _calibrate_hand(
     from torchreg.alignment.calibrate import calibrate as fit
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FramesWarning)  # told below, by the names of files
+        warnings.simplefilter("ignore", FramesWarning)  # reported below, by the names of files
         found = fit(shape, clouds)
     found.save(output)
     if found.outliers:

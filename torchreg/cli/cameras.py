@@ -41,8 +41,7 @@ Mask = Annotated[
     typer.Option(metavar="FILE", help="Picture whose bright pixels may show the shape; or a folder, one per picture."),
 ]
 Seen = Annotated[
-    Path | None,
-    typer.Option(metavar="FOLDER", help="Where pictures of what was seen go; by default RESULT_seen."),
+    Path | None, typer.Option(metavar="FOLDER", help="Where pictures of what was seen go; by default RESULT_seen.")
 ]
 
 

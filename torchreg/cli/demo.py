@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Force, Quiet, check_outputs, counted
+from torchreg.cli.outputs import Force, Quiet, check_outputs, counted, written_to
 from torchreg.cli.reporting import OptionalOutput, interruption, reporting
 from torchreg.cli.writers import Source, write_optional
 
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 @reporting
 def demo(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to write; made if it does not exist.")
-    ] = Path("torchreg_demo"),
+    output: Annotated[Path, written_to("FOLDER", "Where to write; made if it does not exist.")] = Path("torchreg_demo"),
     frames: Annotated[int, typer.Option(min=1, help="Number of frames, 20 per second.")] = 40,
     seed: Annotated[int, typer.Option(help="Seed of motion and measurements.")] = 0,
     no_movie: Annotated[bool, typer.Option("--no-movie", help="Do not draw the animation.")] = False,

@@ -11,7 +11,7 @@ import typer
 
 from torchreg.cli.align_options import Scale
 from torchreg.cli.cameras import DepthOptions
-from torchreg.cli.outputs import Force, Quiet, check_outputs, result_file, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, result_file, with_ending, written_to
 from torchreg.cli.reporting import reporting
 from torchreg.cli.shape_argument import ShapeOptions, chosen_skin
 from torchreg.cli.upright import Up, check_up
@@ -38,9 +38,7 @@ def export(
         list[Path],
         typer.Argument(metavar="RESULT", help="What a command wrote (.safetensors); alignments may be several."),
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT.ENDING", help="The file, or a folder for pictures.")
-    ],
+    output: Annotated[Path, written_to("OUT.ENDING", "The file, or a folder for pictures.")],
     *,
     data: Annotated[
         list[Path] | None,

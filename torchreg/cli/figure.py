@@ -7,17 +7,14 @@ from typing import Annotated
 
 import typer
 
-from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, with_ending, written_to
 from torchreg.cli.reporting import reporting
 
 
 @reporting
 def figure(
     name: Annotated[str, typer.Argument(metavar="bending|readme", help="Which picture to draw.")],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="OUT.png", help="Where to (.png, .pdf, .svg); by default NAME.png."),
-    ] = None,
+    output: Annotated[Path | None, written_to("OUT.png", "Where to (.png, .pdf, .svg); by default NAME.png.")] = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:

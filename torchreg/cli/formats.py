@@ -11,7 +11,7 @@ from torchreg.cli.reporting import reporting
 def formats() -> None:
     """Show the formats of files that are read, by what they hold.
 
-    A format is told by the content of a file, and by its ending where content does not tell; clouds, meshes and their
+    The content of a file decides on its format, or the ending where the content does not; clouds, meshes and their
     tables may be packed by gzip (.gz).
     """
     from torchreg.io.formats import KINDS, table_rows

@@ -1,4 +1,4 @@
-"""Which hand it is: told, or tried."""
+"""Which hand it is: given, or the better of both."""
 
 from __future__ import annotations
 

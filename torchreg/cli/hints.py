@@ -16,9 +16,9 @@ def in_options(message: str, options: Iterable[str]) -> str:
     """Return a message with arguments of functions as options of a command, without hints that it cannot follow."""
     known = set(options)
     parts = _LIMITS.sub("", " ".join(message.split())).split("; ")
-    told = [part if (found := _translated(part, known)) is None else found for part in parts]
-    kept = [part for part, words in zip(told, parts, strict=True) if _can_be_followed(words, known)]
-    return "; ".join(kept or told)
+    translated = [part if (found := _translated(part, known)) is None else found for part in parts]
+    kept = [part for part, words in zip(translated, parts, strict=True) if _can_be_followed(words, known)]
+    return "; ".join(kept or translated)
 
 
 def _option(name: str) -> str:
@@ -42,7 +42,7 @@ def _is_argument(name: str) -> bool:
     return name in _ARGUMENTS
 
 
-# Arguments that messages tell users to give.
+# Arguments that messages ask for.
 _ARGUMENTS = {
     "nan_policy", "skin", "parents", "package_dirs", "meshes", "scale", "time", "frame", "size", "unit", "axes",
     "config", "omit", "mask", "initial_pose", "mesh",

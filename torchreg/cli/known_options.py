@@ -56,18 +56,12 @@ _LIMITS = _Limits()
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the poses of all frames.
-
-    Args:
-        rows: means by name, one for each frame, or one for all; empty without.
-        std: of the means.
-        keypoints: (F, K, C) that a detector measured.
-    """
+    """What is known of the poses of all frames."""
 
     locked: tuple[str, ...] = ()
-    rows: Sequence[Mapping[str, float]] = ()
-    std: float = 0.0
-    keypoints: Tensor | None = None
+    rows: Sequence[Mapping[str, float]] = ()  # means by name, one for each frame, or one for all; empty without
+    std: float = 0.0  # of the means
+    keypoints: Tensor | None = None  # (F, K, C) that a detector measured
     keypoint_std: float | None = None
 
     def prior(self, number: int, origin: Tensor | None = None) -> tuple[Mapping[str, float], float] | None:

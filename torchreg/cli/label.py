@@ -10,7 +10,7 @@ import typer
 from torchreg.cli.align_options import NanPolicy, Scale
 from torchreg.cli.cameras import DepthOptions
 from torchreg.cli.known_options import Initializer, read_initializer
-from torchreg.cli.outputs import Force, Quiet, check_outputs
+from torchreg.cli.outputs import Force, Quiet, check_outputs, written_to
 from torchreg.cli.reporting import interruption, reporting
 from torchreg.cli.shape_argument import Shape, ShapeOptions
 
@@ -26,10 +26,9 @@ def label(
             "them, or one .npz of frames. With --depth depth pictures, folders or patterns of them.",
         ),
     ],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="FOLDER", help="Labels are written here; created where it is missing."),
-    ] = Path("labels"),
+    output: Annotated[Path, written_to("FOLDER", "Labels are written here; created where it is missing.")] = Path(
+        "labels"
+    ),
     *,
     start: Annotated[
         Path | None, typer.Option(help="Pose of the first frame, as for align; searched by default.")

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -37,6 +37,11 @@ PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs that exist.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+
+
+def written_to(metavar: str, words: str) -> Any:
+    """Return the option that names what a command writes."""
+    return typer.Option("--output", "-o", metavar=metavar, help=words)
 
 
 def with_ending(path: Given, endings: Sequence[str], *, add: bool = False) -> Given:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Force, Quiet, check_outputs, result_file, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, result_file, with_ending, written_to
 from torchreg.cli.reporting import reporting
 from torchreg.cli.upright import Up, check_up
 from torchreg.cli.view import Browser, Port, wait_for_interrupt
@@ -30,9 +30,7 @@ def pose(
         ),
     ] = None,
     to: Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Where it should go.")] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT.ply", help="The posed source, colored by bones.")
-    ] = Path("posed.ply"),
+    output: Annotated[Path, written_to("OUT.ply", "The posed source, colored by bones.")] = Path("posed.ply"),
     start: Annotated[
         Path | None, typer.Option(help="Pose to start from: what the page saved; by default that of RESULT.")
     ] = None,

@@ -13,7 +13,7 @@ import typer
 from torchreg.cli.align_options import NanPolicy, Support, cloud_files
 from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.export import Old, check_old
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.cli.writers import Source, joint_table, save_robot, write_optional
@@ -43,11 +43,9 @@ def register(
     ],
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT.glb",
-            help="The moving, skinned source; OUT.safetensors and OUT.json are written beside it. Ending in "
+        written_to(
+            "OUT.glb",
+            "The moving, skinned source; OUT.safetensors and OUT.json are written beside it. Ending in "
             ".safetensors: the result alone, as always of scans without triangles.",
         ),
     ] = _DEFAULT,

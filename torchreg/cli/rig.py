@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.cli.upright import Up, known_up
 from torchreg.cli.writers import Source, write_optional
@@ -30,12 +30,7 @@ def rig(
     ],
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT.glb",
-            help="The skinned mesh with its clip; OUT.safetensors and OUT.json are written beside it.",
-        ),
+        written_to("OUT.glb", "The skinned mesh with its clip; OUT.safetensors and OUT.json are written beside it."),
     ] = Path("rig.glb"),
     template: Annotated[
         int | None, typer.Option(min=0, help="Number of the frame that is rigged, from 0; chosen by default.")

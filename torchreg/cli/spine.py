@@ -13,7 +13,7 @@ import typer
 from torchreg.cli.align_options import NanPolicy, Scale, Support, cloud_files
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
 from torchreg.cli.export import Old, check_old
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, with_ending, written_to
 from torchreg.cli.reporting import OptionalOutput, interruption, reporting
 from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.cli.writers import PICTURES, Source, write_optional
@@ -65,10 +65,9 @@ def spine(
             "their names, one folder of them, or one .npz of them. With --silhouettes one folder of masks per camera.",
         ),
     ],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="OUT.glb", help="OUT.glb, OUT.safetensors and OUT.json are written."),
-    ] = Path("spine.glb"),
+    output: Annotated[Path, written_to("OUT.glb", "OUT.glb, OUT.safetensors and OUT.json are written.")] = Path(
+        "spine.glb"
+    ),
     *,
     hulls: HullOptions,
     scale: Scale = 1.0,
@@ -90,8 +89,7 @@ def spine(
     ] = None,
     tips: Annotated[int | None, typer.Option(min=2, help="Number of tips; without it the most frequent one.")] = None,
     growing: Annotated[
-        bool,
-        typer.Option("--growing", help="Tips may appear and end, as those of a plant; names live as long."),
+        bool, typer.Option("--growing", help="Tips may appear and end, as those of a plant; names live as long.")
     ] = False,
     samples: Annotated[int, typer.Option(min=3, help="Points along each limb.")] = 24,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,

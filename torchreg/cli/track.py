@@ -14,7 +14,7 @@ from torchreg.cli.align_options import FitShape, NanPolicy, Scale, fitted_shape,
 from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
 from torchreg.cli.export import Old, OldWord, check_old
 from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
-from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending
+from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import Shape, ShapeOptions
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary
@@ -42,8 +42,7 @@ class TrackerOptions:
     prediction: Annotated[str, typer.Option(help="Prediction of the motion: velocity, or none.")] = "velocity"
     points: Annotated[int, typer.Option(help="Number of model points.")] = 500
     model_points: Annotated[
-        str,
-        typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape."),
+        str, typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape.")
     ] = "seen"
     recovery: Annotated[
         str, typer.Option(help="What finding a lost shape may cost: full, starts (milliseconds), or none.")
@@ -80,13 +79,7 @@ def track(
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="RESULT",
-            help="RESULT.safetensors, .json, .glb, .gif and .progress are written.",
-        ),
+        Path, written_to("RESULT", "RESULT.safetensors, .json, .glb, .gif and .progress are written.")
     ] = Path("track"),
     *,
     start: Annotated[

@@ -1,4 +1,4 @@
-"""How far a tracker got, in one file: what it found, what its next frame depends on, and what it was told to do."""
+"""How far a tracker got, in one file: what it found, what its next frame depends on, and its options."""
 
 from __future__ import annotations
 

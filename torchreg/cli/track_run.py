@@ -170,28 +170,20 @@ class Report:
 
 @dataclass
 class TrackRun:
-    """Tracks frame after frame, and keeps on disk how far it got.
-
-    Args:
-        job: all that decides about the poses, as plain data.
-        save_every: frames between two writings.
-        seen: draws what the cameras saw of a frame.
-        live: shows a frame in the browser.
-        parts: results of the frames done.
-    """
+    """Tracks frame after frame, and keeps on disk how far it got."""
 
     tracker: Tracker
     clouds: Clouds
     fps: float
-    job: dict[str, Any]
+    job: dict[str, Any]  # all that decides about the poses, as plain data
     files: TrackFiles
     report: Report
-    save_every: int
+    save_every: int  # frames between two writings
     known: Known
     up: Direction | None
-    seen: Callable[[LinearBlendSkin], OnFrame] | None = None
-    live: Callable[[LinearBlendSkin], OnFrame] | None = None
-    parts: list[TrackResult] = field(default_factory=list)
+    seen: Callable[[LinearBlendSkin], OnFrame] | None = None  # draws what the cameras saw of a frame
+    live: Callable[[LinearBlendSkin], OnFrame] | None = None  # shows a frame in the browser
+    parts: list[TrackResult] = field(default_factory=list)  # results of the frames done
     state: TrackState = field(init=False)
 
     def __post_init__(self) -> None:
@@ -294,7 +286,7 @@ class TrackRun:
 
     @cached_property
     def _overlays(self) -> list[tuple[OptionalOutput, OnFrame]]:
-        """What draws each frame as soon as it is done; made after the first, which tells who is fitted."""
+        """What draws each frame as soon as it is done; made after the first, when the fitted shape is known."""
         drawn = []
         pictures = None if self.files.pictures is None else self._drawn
         for name, begin in (("what was seen", self.seen), ("the page", self.live), ("--pictures", pictures)):
@@ -324,7 +316,7 @@ def summary(result: TrackResult) -> str:
     usable = sum(status.usable for status in result.statuses)
     unusable = Counter(status.value for status in result.statuses if not status.usable)
     counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in unusable.items())]
-    # The mean tells of searches rather than of frames.
+    # Searches dominate the mean.
     usual = 1e3 * float(result.seconds.median())
     number = f"{len(result.statuses)} frame{'s' * (len(result.statuses) > 1)}"
     return f"{number}: {', '.join(counts)}; {usual:.0f} ms per frame"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Quiet, with_ending
+from torchreg.cli.outputs import Quiet, with_ending, written_to
 from torchreg.cli.reporting import reporting
 from torchreg.cli.shape_argument import Shape, ShapeOptions
 
@@ -18,12 +18,9 @@ if TYPE_CHECKING:
 @reporting
 def train_initializer(
     shape: Shape,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="OUT.safetensors", help="The weights; beside it a checkpoint and a curve."
-        ),
-    ] = Path("initializer.safetensors"),
+    output: Annotated[Path, written_to("OUT.safetensors", "The weights; beside it a checkpoint and a curve.")] = Path(
+        "initializer.safetensors"
+    ),
     *,
     minutes: Annotated[float, typer.Option(help="Of training; again with more to go on where it ended.")] = 30.0,
     batch: Annotated[int, typer.Option(help="Made-up clouds per step; 512 on a GPU.")] = 64,

@@ -1,4 +1,4 @@
-"""The option --up: what is upright in pictures, pages and glTF files, where neither format nor motion tell."""
+"""The option --up: what is upright in pictures, pages and glTF files, where neither format nor motion determine it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def known_up(up: str | None, files: Sequence[Path | str], *, camera: bool = Fals
 
 
 def _ending(path: Path) -> str:
-    """Return the ending of a file, or of the first one in a folder, that tells its format."""
+    """Return the ending of a file, or of the first one in a folder, that says its format."""
     first = next(iter(sorted(path.iterdir())), path) if path.is_dir() else path
     packed = first.suffix.lower() == ".gz"
     return (first.with_suffix("") if packed else first).suffix.lower()

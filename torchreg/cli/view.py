@@ -76,7 +76,7 @@ def view(
     Exit codes: 0, also after Ctrl-C; 2 for an error.
     """
     if result.suffix:
-        result.stat()  # a missing file is told before all else
+        result.stat()  # a missing file is reported before all else
     html, rerun = with_ending(html, (".html",)), with_ending(rerun, (".rrd",))
     check_outputs([html, rerun], force)
     up_direction = known_up(up, [] if is_result(result) else [result, *(data or [])])

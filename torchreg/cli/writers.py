@@ -25,27 +25,18 @@ PICTURES, MOVIES = (".png", ".pdf", ".svg"), (".gif", ".mp4")
 
 @dataclass
 class Source:
-    """What a file is written from.
+    """What a file is written from."""
 
-    Args:
-        results: one, or the alignments of a motion.
-        data: clouds (M, 3), meshes or depth pictures, one per frame, in the coordinates of the files.
-        shape: of the results, with their coefficients; the one that they keep by default.
-        rig: file of the rigged character that was fitted, and its skin.
-        local: the result in coordinates that begin at its origin, where it is at hand.
-        coarse: makes the surface of moving pictures.
-    """
-
-    results: Sequence[Any]
-    data: Sequence[Any] = ()
-    shape: ArticulatedShape | None = None
-    rig: tuple[str | Path, str | int | None] | None = None
+    results: Sequence[Any]  # one, or the alignments of a motion
+    data: Sequence[Any] = ()  # clouds (M, 3), meshes or depth pictures, one per frame, in the coordinates of the files
+    shape: ArticulatedShape | None = None  # of the results, with their coefficients; the one that they keep by default
+    rig: tuple[str | Path, str | int | None] | None = None  # file of the rigged character that was fitted, and its skin
     up: Direction | None = None
     fps: float = 20.0
     color: str = "bones"
     names: Sequence[str] = ()
-    local: Any = None
-    coarse: Callable[[], LinearBlendSkin] | None = None
+    local: Any = None  # the result in coordinates that begin at its origin, where it is at hand
+    coarse: Callable[[], LinearBlendSkin] | None = None  # makes the surface of moving pictures
     on_frame: Callable[[int, int], None] | None = None
 
     @property
@@ -390,23 +381,15 @@ def _robot_files(path: Path, source: Source) -> list[Path]:
 
 @dataclass(frozen=True)
 class Writer:
-    """A row of the table: which results become which files, and what else that takes.
+    """A row of the table: which results become which files, and what else that takes."""
 
-    Args:
-        kind: of the result, the name of its class; empty for all.
-        endings: of the file; an empty one for a folder.
-        needs: fields of `Source` without which it cannot be written.
-        several: whether one file holds several results.
-        files: the files that a path becomes.
-    """
-
-    kind: str
-    endings: tuple[str, ...]
+    kind: str  # of the result, the name of its class; empty for all
+    endings: tuple[str, ...]  # of the file; an empty one for a folder
     holds: str
     write: Callable[[Path, Source], Any]
-    needs: tuple[str, ...] = ()
-    several: bool = False
-    files: Callable[[Path, Source], list[Path]] = _itself
+    needs: tuple[str, ...] = ()  # fields of `Source` without which it cannot be written
+    several: bool = False  # whether one file holds several results
+    files: Callable[[Path, Source], list[Path]] = _itself  # the files that a path becomes
 
 
 WRITERS = (

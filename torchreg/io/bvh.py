@@ -30,20 +30,10 @@ def save_bvh(
     ends: Tensor | None = None,
     up: Direction | None = None,
 ) -> Path:
-    """Return the path of a .bvh file in which a skeleton of turning joints moves.
+    """Write rigid motions (T, J, 4, 4) of J joints, ``T_world_joint``, as a .bvh file; return its path.
 
-    Convention: all joints are without rotation at rest, with axes along those of the world, y up; the angles of a joint
-    are those by which its parent's motion leaves it turned, ``R_z R_x R_y`` in degrees. Lengths keep their unit.
-
-    Args:
-        path: where to write; the suffix must be .bvh. An existing file is replaced once the new one is complete.
-        names: J different names; blanks become underscores.
-        parents: J indices of parent joints, -1 for the one root, in any order.
-        rest: (J, 4, 4) rigid ``T_world_joint`` at rest.
-        transforms: (T, J, 4, 4) rigid ``T_world_joint`` per frame.
-        fps: frames per second.
-        ends: (J, 3) points at rest at which the joints without children end; at the joints by default.
-        up: the axis that is upright, turned to y; left as it is by default.
+    At rest, at ``rest`` (J, 4, 4), joints have no rotation and axes along the world's, y up; the angles of a joint are
+    ``R_z R_x R_y``, degrees, relative to its parent. Joints without children end at ``ends`` (J, 3), or at themselves.
     """
     target = Path(path)
     if target.suffix.lower() != ".bvh":

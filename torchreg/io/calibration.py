@@ -12,8 +12,8 @@ or one of those cameras alone. Pixels are OpenCV's: whole numbers are the middle
 maps world coordinates to camera coordinates (right, down, forward); ``camera_to_world`` may give its inverse instead,
 and without either the camera is at the origin. Name and distortion (0, 4, 5 or 8 numbers, see `Camera`) may be missing.
 The camera of a depth image may have ``depth_scale``, metres per unit of the file's numbers, or what other programs
-write in its place (``depth_units``, ``depth_factor``, ...); see `load_depth` for those without. `own_entry` tells which
-programs' files are understood beside these.
+write in its place (``depth_units``, ``depth_factor``, ...); see `load_depth` for those without. `own_entry` lists
+the other programs whose files are read.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def load_cameras(path: str | os.PathLike[str], *, scale: float = 1.0, limits: Fi
     Args:
         path: a ``.json`` file as above or of another program, a ``.yml`` or ``.yaml`` file of OpenCV's, ROS's, Kalibr's
             or ORB-SLAM's, a folder with COLMAP's ``cameras.txt`` and ``images.txt``, or one with the files ``left`` and
-            ``right`` of ROS's stereo calibration, whose P tells the distance of the cameras.
+            ``right`` of ROS's stereo calibration, whose P holds the distance of the cameras.
         scale: metres per unit of the lengths in the file, such as 0.001 where the board was measured in millimeters.
         limits: ``max_bytes`` applies.
 
@@ -166,15 +166,7 @@ FORMATS: tuple[FileFormat, ...] = (
 def load_depth_camera(
     path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS
 ) -> tuple[Camera, float | None]:
-    """Return the camera of a depth image, float64, and its scale in metres per unit, None where the file has none.
-
-    Args:
-        path: a file of one camera, see `load_cameras`, which may have depth_scale, or depth_units, depth_factor, ...
-        limits: ``max_bytes`` applies.
-
-    Warns:
-        FileWarning: as `load_cameras`.
-    """
+    """Return the camera of a depth image, float64, and its metres per unit of depth, None where the file has none."""
     file = local_path(path)
     content = read_bytes(file, limits)
     if file.suffix.lower() == ".json" or _is_json(content):
@@ -192,12 +184,7 @@ def load_depth_camera(
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: CameraRig) -> None:
-    """Write cameras as JSON, in full precision.
-
-    Args:
-        path: a ``.json`` file; its folder must exist.
-        cameras: at least one.
-    """
+    """Write cameras as JSON, in full precision."""
     entries = [_entry(camera) for camera in cameras]
     _write(path, {"format": FORMAT, "version": _VERSION, "cameras": entries})
 

@@ -1,4 +1,4 @@
-"""A row of the table of file formats, and how a format is told by content where the ending does not tell."""
+"""A row of the table of file formats, and how content decides on a format where the ending does not."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Foreign:
 
     name: str  # as people call them
     endings: tuple[str, ...]  # lower case, with the dot
-    starts: tuple[bytes, ...]  # first bytes of their content, where these tell
+    starts: tuple[bytes, ...]  # first bytes of their content, where they are characteristic
     way: str  # what to do about such a file
 
 
@@ -79,10 +79,10 @@ class FileFormat:
     read: Callable[..., Any]  # from the content, the path (for files beside it) and the limits
     holds: str  # what is read of it, in a few words
     loader: str  # name of the public function that reads it
-    # whether content is of this format for sure; None where content does not tell
+    # whether content is of this format for sure; None where content does not decide
     sniff: Callable[[bytes], bool] | None = None
     write: Callable[[Any], bytes] | None = None  # a record to bytes; None for formats that are read only
-    written: tuple[str, ...] = ()  # names of the parts that ``write`` keeps beside the points
+    written: tuple[str, ...] = ()  # names of the parts that ``write`` keeps with the points
 
 
 def begins(*starts: bytes) -> Callable[[bytes], bool]:
@@ -150,6 +150,11 @@ def plain_text(content: bytes) -> bytes:
         except UnicodeError as error:
             raise FormatError(f"begins as UTF-16 text but is none ({error}); save it as UTF-8") from error
     return content.removeprefix(_UTF8_MARK)
+
+
+def warn(message: str) -> None:
+    """Say what was left out or put right; `naming` adds the file."""
+    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_byte
 from torchreg.io.natural_order import natural_sorted
 from torchreg.io.points import PointCloud, check_dtype, checked_cloud, load_points, save_points
 
-# Beside meshes and clouds in one folder, files of these endings tell of them: times, poses, notes.
+# In a folder of meshes or clouds, files of these endings describe them: times, poses, notes.
 _NOTES = (".csv", ".txt", ".dat", ".tsv", ".npy", ".asc")
 PathLike = str | os.PathLike[str]
 
@@ -40,7 +40,7 @@ class Frames(Sequence[Tensor]):
 
     Indexing and iterating give (M, 3) tensors on the CPU, a slice gives `Frames` again. M may be zero in archives.
     Reading raises what `load_points` raises; every message names the file, and in an archive the frame. What is left
-    out of frames is told of the first that it concerns. Made by `load_frames`.
+    out of frames is reported for the first that it concerns. Made by `load_frames`.
 
     Args:
         names: of the frames: the path of its file, in an archive also its number.
@@ -94,7 +94,7 @@ class Frames(Sequence[Tensor]):
 
     @contextmanager
     def _telling_once(self, name: str) -> Iterator[None]:
-        """Tell what is left out of a frame only if nothing of the kind was told of an earlier one."""
+        """Report what is left out of a frame unless the same was reported for an earlier one."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FileWarning)
             yield
@@ -186,16 +186,7 @@ def load_frames(
 
 
 def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
-    """Write a sequence of clouds and return the files: one NPZ of frames, or a folder with one PLY per frame.
-
-    Args:
-        path: an archive ending in .npz, which is replaced, or a folder, which is made if it does not exist; in it the
-            files ``frame_0000.ply``, ``frame_0001.ply``, ... are replaced.
-        frames: T clouds (M_t, 3), finite; a folder cannot hold frames without points.
-
-    Returns:
-        Paths of the files, in order.
-    """
+    """Write T clouds (M_t, 3) as an .npz of frames or as a folder of files frame_0000.ply, ...; return the files."""
     target = local_path(path)
     clouds = [as_float_tensor(frame, f"frames[{number}]").detach().cpu() for number, frame in enumerate(frames)]
     if not clouds:

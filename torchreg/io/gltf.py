@@ -12,11 +12,11 @@ from torch import Tensor
 
 from torchreg.errors import ModelError
 from torchreg.io.clouds.raw_cloud import Array
-from torchreg.io.file_format import naming
+from torchreg.io.file_format import naming, warn
 from torchreg.io.gltf_file.document import GltfDocument
 from torchreg.io.gltf_file.parts import read_parts
 from torchreg.io.gltf_file.placement import place_skins
-from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface, warn
+from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface
 from torchreg.io.gltf_file.skins import Skeleton, ancestors, read_skeleton, shown_nodes
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
@@ -27,34 +27,20 @@ class RigRecord:
 
     The file's own deformation is ``x = sum_j w_j T_world_joint_j joint_transforms_j^-1 v``; with
     ``rest_transforms`` it gives the pose that a viewer shows before an animation plays.
-
-    Args:
-        name: name of the skin, or of the file.
-        joint_names: J different names, in the file's order; a repeated name gets ``#`` and its index.
-        parents: J indices of parent joints, -1 for roots; parents may come after their children.
-        joint_transforms: (J, 4, 4) float64 rigid ``T_world_joint`` of the pose that ``vertices`` are in.
-        rest_transforms: (J, 4, 4) float64 rigid ``T_world_joint`` of the node hierarchy.
-        vertices: (V, 3) float64, also those no face uses; of one skin after the other, rigid meshes last.
-        faces: (F, 3) int64.
-        normals: (V, 3) float64, or None when a part of the mesh has none.
-        weights: (V, J) float64, rows sum to one.
-        is_rigid: whether nothing is skinned: every mesh moves with its node.
-        slides: names of the joints that a clip slides.
-        fixed: names of the joints that nothing turns.
     """
 
-    name: str
-    joint_names: tuple[str, ...]
-    parents: tuple[int, ...]
-    joint_transforms: Tensor
-    rest_transforms: Tensor
-    vertices: Tensor
-    faces: Tensor
-    normals: Tensor | None
-    weights: Tensor
-    is_rigid: bool = False
-    slides: tuple[str, ...] = ()
-    fixed: tuple[str, ...] = ()
+    name: str  # name of the skin, or of the file
+    joint_names: tuple[str, ...]  # J different names, in the file's order; a repeated name gets ``#`` and its index
+    parents: tuple[int, ...]  # J indices of parent joints, -1 for roots; parents may come after their children
+    joint_transforms: Tensor  # (J, 4, 4) float64 rigid ``T_world_joint`` of the pose that ``vertices`` are in
+    rest_transforms: Tensor  # (J, 4, 4) float64 rigid ``T_world_joint`` of the node hierarchy
+    vertices: Tensor  # (V, 3) float64, also those no face uses; of one skin after the other, rigid meshes last
+    faces: Tensor  # (F, 3) int64
+    normals: Tensor | None  # (V, 3) float64, or None when a part of the mesh has none
+    weights: Tensor  # (V, J) float64, rows sum to one
+    is_rigid: bool = False  # whether nothing is skinned: every mesh moves with its node
+    slides: tuple[str, ...] = ()  # names of the joints that a clip slides
+    fixed: tuple[str, ...] = ()  # names of the joints that nothing turns
 
 
 def load_rig(
@@ -67,28 +53,9 @@ def load_rig(
 ) -> RigRecord:
     """Return the skeleton, the meshes and the skin weights of a glTF file.
 
-    All triangle primitives of all meshes that skins move are concatenated, and the joints of all skins are one
-    skeleton. The bind pose stands in the scene as the nodes have it: turned and scaled by what is above the skeleton.
-    The transform of a skinned mesh's node is ignored, as glTF demands. Meshes without a skin that hang on a joint are
-    rigid parts of it. In a file without any skin, the nodes that a clip moves, or meshes that hang on meshes, are the
-    joints of rigid parts.
-
-    Args:
-        path: a .glb or .gltf file; buffers may be embedded or lie in the same folder or below.
-        mesh: name or index of the one mesh to read; all by default.
-        skin: name or index of the one skin to read; all by default.
-        parents: parent joint by joint name, None for a root: replaces the file's hierarchy for the joints it names.
-            For files that list all joints side by side.
-        limits: largest sizes accepted.
-
-    Returns:
-        The rig; without inverse bind matrices, the node hierarchy gives ``joint_transforms``.
-
-    Warns:
-        FileWarning: if something was left out or put right: primitives without positions or skin, vertices without
-            weight (they follow the nearest vertex that has some), joints that move nothing and were stored without a
-            place (they stand where their node does), joints of one name, joints that scale their part of the skin
-            unlike others, skins with skeletons of their own, meshes without a skin.
+    The joints of all skins are one skeleton, whose bind pose stands in the scene as the nodes have it. Meshes without a
+    skin that hang on a joint are rigid parts of it; without any skin, the nodes that a clip moves are the joints.
+    ``parents`` names the parent of joints that a file lists side by side. What is left out or repaired is warned of.
     """
     source = local_path(path)
     content = read_bytes(source, limits)

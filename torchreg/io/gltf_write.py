@@ -54,36 +54,12 @@ def save_animated_skin(
     most_weights: int | None = None,
     up: Direction | None = None,
 ) -> Path:
-    """Return the path of a .glb file with a mesh that linear blend skinning moves over time.
+    """Write a skinned mesh that moves as a .glb file; return its path.
 
-    The file plays ``x(t) = sum_j w_j T_world_joint_j(t) T_world_joint_j(rest)^-1 x`` in any glTF viewer. glTF stores
-    weights by fours: the four largest are kept and renormalized, eight where any vertex has a fifth above 1e-4 unless
-    ``most_weights`` is 4, all that many viewers read.
-
-    Convention: ``T_world_joint`` maps joint to world coordinates; between frames, translations are interpolated
-    linearly and rotations along the shorter arc, each relative to the parent joint.
-
-    Args:
-        path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.
-        vertices: (V, 3) in the rest pose, metres.
-        faces: (F, 3) integers.
-        weights: (V, J), not negative, rows that sum to more than zero.
-        joint_names: J different names.
-        parents: J indices of parent joints, -1 for roots, in any order.
-        rest_transforms: (J, 4, 4) rigid ``T_world_joint`` of the pose that ``vertices`` are in.
-        joint_transforms: (T, J, 4, 4) rigid ``T_world_joint`` per frame.
-        times: (T,) seconds, not negative, strictly increasing.
-        normals: (V, 3) at the vertices; zero rows become +z, which viewers need to be of unit length.
-        colors: (V, 3) or (V, 4) in [0, 1].
-        most_weights: 4 or 8, or None to decide by the weights.
-        up: the axis that is upright, turned to glTF's y by the root node; left as it is by default.
-
-    Returns:
-        The path written.
-
-    Raises:
-        InputError: if shapes, ranges or values do not fit, or a transform is not rigid.
-        InputTypeError: if an argument does not hold numbers of the right kind.
+    Vertices (V, 3), metres, with weights (V, J) are at rest in ``rest_transforms`` (J, 4, 4), and move with
+    ``joint_transforms`` (T, J, 4, 4), all rigid ``T_world_joint``, at times (T,), seconds. Between frames translations
+    are interpolated linearly and rotations along the shorter arc, relative to the parent joint. ``most_weights`` a
+    vertex are 4 or 8, by default as many as needed; the root node turns ``up`` to glTF's y.
     """
     target = checked_path(path)
     if most_weights not in (None, 4, 8):
@@ -136,24 +112,11 @@ def save_animated_parts(
     parents: Sequence[int] | None = None,
     up: Direction | None = None,
 ) -> Path:
-    """Return the path of a .glb file in which each rigid part is a moving node.
+    """Write rigid parts that move as the nodes of a .glb file; return its path.
 
-    Between frames, parts move relative to their parents: translations are interpolated linearly, rotations along the
-    shorter arc.
-
-    Args:
-        path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.
-        part_meshes: P meshes in part coordinates, metres; None for a part without a shape.
-        part_transforms: (T, P, 4, 4) rigid ``T_world_part`` per frame.
-        times: (T,) seconds, not negative, strictly increasing.
-        part_names: P different names; part_0, part_1, ... by default.
-        colors: (P, 3) or (P, 4) in [0, 1].
-        part_normals: P normals (V, 3) at the vertices, None where a part has none.
-        parents: P indices of parent parts, -1 for roots, in any order; by default all are roots.
-        up: the axis that is upright, turned to glTF's y by a root node; left as it is by default.
-
-    Returns:
-        The path written.
+    Meshes are in part coordinates, metres, None for a part without; ``part_transforms`` (T, P, 4, 4) are rigid
+    ``T_world_part`` at times (T,), seconds. Between frames parts move relative to their parents, see
+    `save_animated_skin`.
     """
     target = checked_path(path)
     names = [f"part_{index}" for index in range(len(part_meshes))] if part_names is None else list(part_names)

@@ -19,7 +19,7 @@ from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
 from torchreg.io.clouds.npz import ARRAY_START, array_of, read_npy_header
-from torchreg.io.file_format import check_stand_in, naming
+from torchreg.io.file_format import check_stand_in, naming, warn
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.masks import mask_of_numbers, mask_of_picture
 from torchreg.io.natural_order import last_number, natural_sorted
@@ -63,12 +63,7 @@ def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, .
 
 
 def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
-    """Return a picture of 8 bits per channel, (H, W) gray or (H, W, 3) color, as float32 from 0 to 1.
-
-    Args:
-        path: a PNG, JPEG, TIFF or BMP file; transparency is left out.
-        limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
-    """
+    """Return a picture of 8 bits per channel, (H, W) gray or (H, W, 3) color, as float32 from 0 to 1."""
     pixels = _read_pixels(local_path(path), limits)
     return torch.from_numpy(pixels).to(torch.float32).div_(255)
 
@@ -82,19 +77,7 @@ def _read_pixels(file: Path, limits: FileLimits) -> Any:
 
 
 def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
-    """Return a mask (H, W), bool.
-
-    Transparency that varies is the mask. Otherwise the brighter of two values is set, whatever they are; in a picture
-    of labels all but black or zero; elsewhere, also where a halo surrounds what is white, what is at least half as
-    bright as the picture's own white.
-
-    Args:
-        path: a PNG, JPEG, TIFF or BMP file of any bit depth, also with a palette, or a ``.npy`` array (H, W).
-        limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
-
-    Warns:
-        FileWarning: if the mask keeps all or nothing, or the file holds several labels or a halo.
-    """
+    """Return a mask (H, W), bool, of a picture, see `mask_of_picture`, or of an ``.npy`` array."""
     file = local_path(path)
     content = read_bytes(file, limits)
     with naming(file):
@@ -113,19 +96,9 @@ def load_depth(
 ) -> Tensor:
     """Return a depth image (H, W) in metres, float32, zero where nothing was measured.
 
-    Zero, negative numbers, what is not finite, and the largest numbers that formats have (65535, 65504, 1e9 and more)
-    say that nothing was measured.
-
-    Args:
-        path: a PNG or TIFF file of 16 bits, a TIFF or EXR file of floating-point numbers, or a ``.npy`` array (H, W) of
-            16-bit integers or floating-point numbers.
-        scale: metres per unit of the file. None: whole numbers are millimeters, floating-point numbers metres, or
-            millimeters where no camera would see that far.
-        camera: its picture must have that size.
-        limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
-
-    Warns:
-        FileWarning: if the depths are unlikely in their unit; names them.
+    Not measured are zero, negative and infinite numbers, and the largest ones of formats (65535, 65504, 1e9 and more).
+    ``scale`` is metres per unit; by default whole numbers are millimeters, others metres, or millimeters where no
+    camera would see that far.
     """
     file = local_path(path)
     content = read_bytes(file, limits)
@@ -182,7 +155,7 @@ def _unit(values: Any, scale: float | None) -> float:
         elif middle <= _SIGHT.most:
             scale = 1.0
         else:
-            _warn(f"numbers around {middle:.4g} are taken for millimeters; the camera's depth_scale says otherwise")
+            warn(f"numbers around {middle:.4g} are taken for millimeters; the camera's depth_scale says otherwise")
             scale = MILLIMETER
     depth = middle * scale
     if depth > _SIGHT.impossible:
@@ -192,15 +165,11 @@ def _unit(values: Any, scale: float | None) -> float:
         )
     if not _SIGHT.least <= depth <= _SIGHT.most:
         factor = "0.001" if depth > _SIGHT.most else "1"
-        _warn(
+        warn(
             f"depths around {depth:.3g} m are unlikely: with depth_scale {scale:g} the file's {middle:.4g} is in other "
             f"units; write depth_scale {factor} if they are {'millimeters' if depth > _SIGHT.most else 'metres'}"
         )
     return scale
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = MILLIMETER) -> None:

@@ -23,18 +23,10 @@ def load_keypoints(
     picture: tuple[int, int] | None = None,
     limits: FileLimits = DEFAULT_LIMITS,
 ) -> Tensor:
-    """Return the keypoints (F, K, C) of F frames, float64, NaN for those that were not seen.
+    """Return keypoints (F, K, C) of F frames, float64, NaN where not detected: pixels [column, row], or metres.
 
-    The file holds a list of frames, or a single one: a list of K keypoints, each [column, row] in pixels, [x, y, z] in
-    metres, or null where it was not seen; or what MediaPipe's hand landmarker or OpenPose wrote of the frame. A frame
-    in which none was seen may be null. A folder holds a file for each frame, in the order of the numbers in their
-    names.
-
-    Args:
-        path: ends in .json, or is a folder of such files.
-        side: "left" or "right", where a detector saw several hands; by default the surest.
-        picture: (width, height), pixels, for keypoints of MediaPipe, which are shares of them.
-        limits: ``max_bytes`` applies to each file.
+    A .json file holds one frame or a list of them, or what MediaPipe's hand landmarker or OpenPose wrote; a folder
+    holds a file for each frame. ``side`` chooses a hand, ``picture`` (width, height) is for MediaPipe's shares of it.
     """
     file = local_path(path)
     files = natural_sorted(file.glob("*.json")) if file.is_dir() else [file]

@@ -53,10 +53,7 @@ DEFAULT_LIMITS = FileLimits()
 
 @dataclass(frozen=True)
 class FileBudget:
-    """What a file may ask for beyond `FileLimits`, such that none below 10 MB takes 500 MB or 3 s.
-
-    Pictures have their limits in `torchreg.geometry.budget`, for what their pixels need.
-    """
+    """What a file may ask for beyond `FileLimits`, such that none below 10 MB takes 500 MB or 3 s."""
 
     # Frames of one archive: an hour at 25 per second.
     frames: int = 100_000
@@ -93,11 +90,7 @@ FILE_BUDGET = FileBudget()
 
 
 def local_path(path: str | os.PathLike[str]) -> Path:
-    """Return ``path`` as a local path.
-
-    Args:
-        path: name of a file on this machine.
-    """
+    """Return ``path`` as a local path; FormatError if it is an address."""
     if not isinstance(path, (str, os.PathLike)) or isinstance(os.fspath(path), bytes):
         raise InputTypeError(f"path must be a str or a pathlib.Path, got {type(path).__name__}")
     text = os.fspath(path)
@@ -109,12 +102,7 @@ def local_path(path: str | os.PathLike[str]) -> Path:
 
 
 def read_bytes(path: str | os.PathLike[str], limits: FileLimits = DEFAULT_LIMITS) -> bytes:
-    """Return the content of a local regular file, once its size is checked.
-
-    Args:
-        path: the file.
-        limits: ``max_bytes`` applies.
-    """
+    """Return the content of a local regular file, once its size is checked."""
     file = local_path(path)
     mode = file.stat().st_mode  # before open(), which waits forever on a pipe
     if stat.S_ISDIR(mode):
@@ -165,12 +153,7 @@ def check_expansion(packed: int, expanded: int, what: str, limits: FileLimits) -
 
 
 def open_zip(content: bytes, limits: FileLimits = DEFAULT_LIMITS) -> zipfile.ZipFile:
-    """Return the zip archive in ``content``; the claimed sizes of all members are checked before any is expanded.
-
-    Args:
-        content: the bytes of the archive.
-        limits: ``max_zip_ratio`` and ``max_expanded_bytes`` apply to the sum over all members.
-    """
+    """Return the zip archive in ``content``; the claimed sizes of all members are checked before any is expanded."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
     except ZIP_ERRORS as error:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from torchreg.errors import FileWarning
 from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.file_format import warn
 
 
 @dataclass(frozen=True)
 class _Labels:
-    """How pictures of labels are told from masks with soft edges and halos."""
+    """What distinguishes pictures of labels from masks with soft edges and halos."""
 
     interior: float = 0.5  # share of the pixels between dark and bright whose four neighbors are equal to them
     # Of a halo, which has regions of one value too: labels are fewer, touch what is around them, and are larger.
@@ -63,13 +62,9 @@ def mask_of_numbers(values: Array) -> Array:
     if values.dtype.kind != "f" and low == 0 and _has_labels(values, ~ends):
         count = len(np.unique(values)) - 1
         if is_gray and _has_halo(values == 0, values == high, high):
-            warnings.warn(
-                f"what is {high:g} has a halo of {count - 1} other value(s): what is at least half as bright is set",
-                FileWarning,
-                stacklevel=2,
-            )
+            warn(f"what is {high:g} has a halo of {count - 1} other value(s): what is at least half as bright is set")
             return values >= 0.5 * high
-        warnings.warn(f"holds {count} labels: all but 0 are set", FileWarning, stacklevel=2)
+        warn(f"holds {count} labels: all but 0 are set")
         return values != 0
     if values.dtype.kind == "f" and low < 0:  # scores whose sign decides
         return _told(known & (values > 0))
@@ -108,9 +103,5 @@ def _has_halo(dark: Array, bright: Array, white: float) -> bool:
 def _told(mask: Array) -> Array:
     """Return a mask, after a warning if it keeps all or nothing."""
     if mask.all() or not mask.any():
-        warnings.warn(
-            f"the mask {'keeps all' if mask.all() else 'keeps none'} of its {mask.size} pixels; is it the right file?",
-            FileWarning,
-            stacklevel=2,
-        )
+        warn(f"the mask {'keeps all' if mask.all() else 'keeps none'} of its {mask.size} pixels; is it the right file?")
     return mask

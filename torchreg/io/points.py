@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 import tokenize
-import warnings
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -16,13 +15,13 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import all_finite, as_float_tensor, check_choice, check_finite, check_positive, check_shape
-from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
+from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
 from torchreg.io.clouds.cloud_formats import FORMATS
 from torchreg.io.clouds.raw_cloud import Array, RawCloud, not_measured
-from torchreg.io.file_format import FileFormat, choose, naming, unpacked
+from torchreg.io.file_format import FileFormat, choose, naming, unpacked, warn
 from torchreg.io.gltf_file.glb import read_gltf
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
 
@@ -89,7 +88,7 @@ def load_points(
 ) -> PointCloud:
     """Return the points of a file, with normals, faces and colors where it has them.
 
-    The format is told by the content, and by the ending where content does not tell; ``torchreg formats`` lists them.
+    The content decides on the format, or the ending where the content does not; ``torchreg formats`` lists the formats.
     Files may be packed by gzip. Points keep the order and the unit of the file. What cannot be used - normals that are
     not finite or zero, faces of two corners, colors of some vertices only, and points 0 0 0, where organized clouds and
     padded ones have nothing - is left out with a warning that counts it; a single point at the origin stays.
@@ -138,7 +137,7 @@ def load_points(
 
 
 def _clip(kind: FileFormat, time: float | None, frame: int | None) -> dict[str, Any]:
-    """Return the options of a reader that tell a time; InputError if it has none."""
+    """Return the options of a reader that choose a time; InputError if it has none."""
     given = {name: value for name, value in (("time", time), ("frame", frame)) if value is not None}
     if given and kind.read is not read_gltf:
         raise InputError(f"{' and '.join(given)} choose a moment of an animation, which {kind.name} files do not have")
@@ -200,8 +199,8 @@ def checked_cloud(
     if count == 0 and not may_be_empty:
         raise FormatError("holds no points")
     normals = None if raw.normals is None else _rows(raw.normals, "normals", count)
-    told = None if raw.colors is None else _unit_colors(raw.colors)
-    colors = None if told is None else _rows(told, "colors", count)
+    shares = None if raw.colors is None else _unit_colors(raw.colors)
+    colors = None if shares is None else _rows(shares, "colors", count)
     faces = None if raw.faces is None else _face_rows(raw.faces, count, limits)
     measured = _measured_rows(points, faces)
     points, normals, colors, faces = _of_rows(measured, points, normals, colors, faces)
@@ -216,7 +215,7 @@ def checked_cloud(
     normals = None if normals is None else _usable_normals(normals, points, faces)
     if colors is not None and not bool(colors.isfinite().all()):
         damaged = int((~colors.isfinite()).any(-1).sum())
-        _warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
+        warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
         colors = None
     return PointCloud(points=points, normals=normals, faces=faces, colors=colors)
 
@@ -243,7 +242,7 @@ def _measured_rows(points: Tensor, faces: Tensor | None) -> Tensor:
         return torch.ones_like(measured)
     if missing == len(points):
         raise FormatError(f"all of its {missing} points are 0 0 0: nothing was measured")
-    _warn(not_measured(missing, len(points)))
+    warn(not_measured(missing, len(points)))
     return measured
 
 
@@ -277,16 +276,12 @@ def _usable_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Te
     counts = [f"{int(rows.sum())} of {len(normals)} normals are {what}" for rows, what in
               ((infinite, "not finite"), (zero, "of length zero")) if bool(rows.any())]  # fmt: skip
     if faces is not None and len(faces):
-        told = TriangleMesh(points, faces).vertex_normals()
-        if bool(told[bad].any(-1).all()):
-            _warn(f"{', '.join(counts)}; they are computed from the faces")
-            return torch.where(bad.unsqueeze(-1), told, normals)
-    _warn(f"normals are left out: {', '.join(counts)}")
+        computed = TriangleMesh(points, faces).vertex_normals()
+        if bool(computed[bad].any(-1).all()):
+            warn(f"{', '.join(counts)}; they are computed from the faces")
+            return torch.where(bad.unsqueeze(-1), computed, normals)
+    warn(f"normals are left out: {', '.join(counts)}")
     return None
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def _rows(values: Array, what: str, count: int | None) -> Tensor:
@@ -299,16 +294,13 @@ def _rows(values: Array, what: str, count: int | None) -> Tensor:
 
 
 def _unit_colors(colors: Array) -> Array | None:
-    """Return colors from 0 to 1; None, with a warning, if the numbers can be none.
-
-    Bytes are bytes. Other numbers are told by their range, as many programs write bytes as floats or wide integers.
-    """
+    """Return colors from 0 to 1, by the range of the numbers if not bytes; None, with a warning, if they are none."""
     if colors.dtype == np.uint8:
         return colors / 255.0
     known = colors[np.isfinite(colors)] if colors.dtype.kind == "f" else colors
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if low < 0 or high > 65535:
-        _warn(f"colors are left out: they run from {low:g} to {high:g}, not from 0 to 1 or 255")
+        warn(f"colors are left out: they run from {low:g} to {high:g}, not from 0 to 1 or 255")
         return None
     if colors.dtype.kind == "f" and high <= 1 + 1e-6:
         return np.clip(colors, 0.0, 1.0)
@@ -326,21 +318,11 @@ def _face_rows(faces: Array, count: int, limits: FileLimits) -> Tensor:
 
 
 def save_points(
-    path: str | os.PathLike[str],
-    points: Any,
-    normals: Any = None,
-    colors: Any = None,
-    *,
-    faces: Any = None,
+    path: str | os.PathLike[str], points: Any, normals: Any = None, colors: Any = None, *, faces: Any = None
 ) -> None:
-    """Write a point cloud; the file appears whole or not at all.
+    """Write points (N, 3), normals (N, 3), colors (N, 3) from 0 to 1 and faces (F, 3); whole or not at all.
 
-    Args:
-        path: a local file ending in .ply, .pcd, .xyz, .txt, .csv or .npz; an existing file is replaced.
-        points: (N, 3) finite coordinates; their precision is kept.
-        normals: (N, 3) or None.
-        colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .csv, .npz); stored as bytes.
-        faces: (F, 3) vertex indices or None (.ply, .npz).
+    The path ends in .ply, .pcd, .xyz, .txt, .csv or .npz; colors are stored as bytes.
     """
     file = local_path(path)
     ending = file.suffix.lower()

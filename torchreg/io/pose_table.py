@@ -32,13 +32,7 @@ def save_pose_table(
 def load_pose_table(
     path: str | os.PathLike[str], names: Sequence[str], *, limits: FileLimits = DEFAULT_LIMITS
 ) -> list[dict[str, float]]:
-    """Return the numbers by name of every row of a table; columns of other names are let be.
-
-    Args:
-        path: with commas, semicolons or tabs between the columns; numbers may have decimal commas.
-        names: of the columns that are read, those of them that are there.
-        limits: ``max_bytes`` applies.
-    """
+    """Return the numbers by name of every row of a table; columns of other names are left alone."""
     file = local_path(path)
     try:
         lines = plain_text(read_bytes(file, limits)).decode("utf-8").splitlines()

@@ -22,15 +22,7 @@ class _NodeType(IntEnum):
 
 
 def save_swc(path: str | os.PathLike[str], skeleton: Skeleton, comment: str = "") -> None:
-    """Write a skeleton; the format does not hold frames, confidence and notes.
-
-    The first tip is the root. Branchings have the type 5, ends 6, other nodes 0.
-
-    Args:
-        path: a local file ending in .swc; an existing one is replaced, whole or not at all.
-        skeleton: the tree.
-        comment: lines to begin with.
-    """
+    """Write a skeleton: its first tip is the root; branchings have the type 5, ends 6, other nodes 0."""
     file = local_path(path)
     if file.suffix.lower() != ".swc":
         raise InputError(f"path must end in .swc, got {file.name!r}; rename the output file")
@@ -48,16 +40,7 @@ def save_swc(path: str | os.PathLike[str], skeleton: Skeleton, comment: str = ""
 
 
 def load_swc(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Skeleton:
-    """Return the skeleton of a file, float64.
-
-    Args:
-        path: a local file.
-        limits: on its size.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FormatError: if a line is damaged, or the nodes make no single tree; names the file.
-    """
+    """Return the skeleton of a file, float64; FormatError if its nodes make no single tree."""
     file = local_path(path)
     rows = []
     for number, line in enumerate(read_bytes(file, limits).decode("utf-8", "replace").splitlines(), start=1):

@@ -27,16 +27,10 @@ _NON_FINITE = "$float"
 
 
 def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write tensors to ``path``, and their description and metadata to a JSON file of the same stem.
+    """Write tensors to a .safetensors file, and their description and metadata to a JSON file of the same stem.
 
-    Each file appears whole or not at all. The JSON file is written last and holds the checksum of the other, so a crash
-    between the two is detected when they are loaded.
-
-    Args:
-        path: a local file ending in .safetensors; an existing pair is replaced.
-        tensors: name to tensor, of any shape; stored detached, on the CPU.
-        metadata: nested dicts (keys are str), lists, tuples (come back as lists), str, bool, int, float, None.
-            Infinite and NaN floats are allowed.
+    Each appears whole or not at all. The JSON file is written last and holds the checksum of the other. Metadata are
+    nested dicts, lists, tuples (come back as lists), str, bool, int, float, also infinite and NaN, and None.
     """
     file, description = _pair(path)
     stored = dict[str, Tensor]()
@@ -66,12 +60,7 @@ def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], me
 def load_tensors(
     path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the tensors of a file by name, on the CPU, and the metadata that `save_tensors` wrote with them.
-
-    Args:
-        path: the .safetensors file; its JSON file must lie beside it.
-        limits: ``max_bytes`` applies to each of the two.
-    """
+    """Return the tensors of a file by name, on the CPU, and the metadata that `save_tensors` wrote with them."""
     file, description = _pair(path)
     content = read_bytes(file, limits)
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +12,14 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice
-from torchreg.errors import FileWarning, FormatError, ModelError
+from torchreg.errors import FormatError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
-from torchreg.io.file_format import check_stand_in, naming
+from torchreg.io.file_format import check_stand_in, naming, warn
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_allowed, local_path, read_bytes
-from torchreg.io.mesh_files import MeshFiles
-from torchreg.io.strict_xml import parse_lenient_xml
+from torchreg.io.urdf_file.mesh_files import MeshFiles
 from torchreg.io.urdf_file.record import UrdfPrimitive, UrdfRecord
+from torchreg.io.urdf_file.strict_xml import parse_lenient_xml
 from torchreg.io.urdf_file.units import warn_about_lengths
 
 # Attributes of a mimic joint: added to its multiple of the other.
@@ -55,28 +54,11 @@ def load_urdf(
     meshes: str = "warn",
     limits: FileLimits = DEFAULT_LIMITS,
 ) -> UrdfRecord:
-    """Return the kinematic tree and the geometry of a URDF file, with all numbers in float64.
+    """Return the kinematic tree and the geometry of a URDF file, float64, parents first.
 
-    Frames come parents first, each branch in the file's order. A mimic joint that follows another mimic joint is
-    rewritten to follow the first one. A joint without ``<limit>`` (or without both bounds) is unlimited.
-
-    The file is read as ROS's tools read it: namespaces mean nothing, comments may stand anywhere, and what cannot be
-    used of a link is left out with a warning. Floating and planar joints are held fixed, with a warning.
-
-    Args:
-        path: the .urdf file.
-        package_dirs: folders to search for meshes: of ``package://NAME/...`` and ``model://NAME/...`` such a folder
-            holds NAME or is called NAME. The folder of the file and those above are searched as well.
-        meshes: what becomes of mesh files that are missing or need a reader that is not installed: "warn" leaves them
-            out with a warning each, "skip" without, "require" raises.
-        limits: largest sizes accepted; a robot may have 2000 links.
-
-    Returns:
-        The robot. A link without readable visual geometry has its collision geometry.
-
-    Warns:
-        FileWarning: if something is left out or held fixed, an element has two origins, or angles seem to be degrees.
-        UnitsWarning: if links, joints or slides seem to be in another unit than the rest.
+    It is read as ROS's tools read it. A mimic joint of a mimic joint follows the first one. A link without readable
+    visual geometry has its collision geometry. What is left out or held fixed, and numbers that seem to be in another
+    unit, are warned of. ``meshes``, of files that are missing or cannot be read: "warn", "skip" or "require".
     """
     check_choice(meshes, "meshes", ("warn", "require", "skip"))
     source = local_path(path)
@@ -187,7 +169,7 @@ def _ordered(
             raise ModelError(
                 f"{path}: the robot is disconnected, {len(roots)} links have no parent: {', '.join(roots[:5])}"
             )
-        _warn(
+        warn(
             f"the robot is disconnected: {len(links) - len(largest)} of {len(links)} links are left out, as no joint "
             f"ties them to the largest tree: {', '.join(others[:5])}"
         )
@@ -205,10 +187,6 @@ def _tree_of(
         waiting.extend((child, len(order)) for child in reversed(children[name]))
         order.append((name, (carrier[name], above) if above >= 0 else None))
     return order
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def _link_of(path: Path, joint: ET.Element, name: str, role: str, links: Mapping[str, ET.Element]) -> str:
@@ -246,9 +224,7 @@ def _build_joint(
     element, what = joints[name], f"{path}: joint {name!r}"
     offset = _origin(element, what)
     if element.get("type") in _HELD:
-        _warn(
-            f"joint {name!r} is {element.get('type')}; it is held fixed, as joints turn about or slide along one axis"
-        )
+        warn(f"joint {name!r} is {element.get('type')}; it is held fixed, as joints turn about or slide along one axis")
     if _kind(joints, name, what) == "fixed":
         return Joint(name, parent, offset)
     axis = _floats(element.find("axis"), "xyz", 3, (1.0, 0.0, 0.0), what)
@@ -287,7 +263,7 @@ def _limits(element: ET.Element, what: str) -> tuple[float, float]:
     lower, upper = (_floats(limit, bound, 1, (0.0,), what)[0] for bound in ("lower", "upper"))
     widest = max(abs(lower), abs(upper))
     if element.get("type") == "revolute" and _PLAUSIBLE.turns < widest <= _PLAUSIBLE.degrees:
-        _warn(
+        warn(
             f"joint {element.get('name')!r} has limits {lower:g} to {upper:g}, which are radians; if they are degrees "
             f"write {math.radians(lower):.4g} to {math.radians(upper):.4g}"
         )
@@ -352,9 +328,9 @@ def _origin(element: ET.Element, what: str) -> Tensor:
     translation = _floats(origin, "xyz", 3, (0.0, 0.0, 0.0), what)
     roll, pitch, yaw = _floats(origin, "rpy", 3, (0.0, 0.0, 0.0), what)
     if len(element.findall("origin")) > 1:
-        _warn(f"{what} has {len(element.findall('origin'))} origins; the first counts, as in ROS")
+        warn(f"{what} has {len(element.findall('origin'))} origins; the first counts, as in ROS")
     if max(map(abs, (roll, pitch, yaw))) > _PLAUSIBLE.turns:
-        _warn(f"{what} is turned by rpy {roll:g} {pitch:g} {yaw:g}, which are radians; are they degrees?")
+        warn(f"{what} is turned by rpy {roll:g} {pitch:g} {yaw:g}, which are radians; are they degrees?")
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
     return torch.tensor(
         [
@@ -396,11 +372,11 @@ class _Geometry:
     def _placed_mesh(self, shape: ET.Element, origin: Tensor, what: str) -> list[TriangleMesh]:
         filename = shape.get("filename")
         if not filename:
-            _warn(f"{what} is left out: its <mesh> has no filename")
+            warn(f"{what} is left out: its <mesh> has no filename")
             return []
         scale = torch.tensor(_floats(shape, "scale", 3, (1.0, 1.0, 1.0), what), dtype=torch.float64)
         if bool((scale == 0).any()):
-            _warn(f"{what} is left out: its mesh has a scale of zero")
+            warn(f"{what} is left out: its mesh has a scale of zero")
             return []
         mesh = self._files.read(filename, what)
         if mesh is None:
@@ -418,12 +394,12 @@ class _Geometry:
 def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive | None:
     """Return a solid; None, with a warning, if it is of another kind or has no size."""
     if shape.tag not in _PRIMITIVES:
-        _warn(f"{what} is left out: its geometry <{shape.tag}> is none of mesh, {', '.join(_PRIMITIVES)}")
+        warn(f"{what} is left out: its geometry <{shape.tag}> is none of mesh, {', '.join(_PRIMITIVES)}")
         return None
     attributes, size = _PRIMITIVES[shape.tag], tuple[float, ...]()
     for attribute, count in attributes.items():
         size += _floats(shape, attribute, count, (), what)
     if len(size) < sum(attributes.values()) or min(size) <= 0:
-        _warn(f"{what} is left out: <{shape.tag}> needs a positive {' and '.join(attributes)}, got {size}")
+        warn(f"{what} is left out: <{shape.tag}> needs a positive {' and '.join(attributes)}, got {size}")
         return None
     return UrdfPrimitive(shape.tag, size, origin)

@@ -16,10 +16,7 @@ Value = TypeVar("Value")
 
 
 class LatestWorker(Generic[Key, Value]):
-    """A thread that calls ``work`` with {key: newest value} of the keys that changed since the last call.
-
-    Submitting never waits. Errors of ``work`` go to ``on_error``; the thread goes on.
-    """
+    """A thread that calls ``work`` with {key: newest value} of what changed since; submitting never waits."""
 
     def __init__(
         self,

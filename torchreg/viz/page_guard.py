@@ -1,7 +1,7 @@
 """Who may use a page that is served to this machine: only who has its address, and no page of another origin.
 
 Any page that the user has open, wherever it came from, may send requests to this machine. A request passes only if its
-Host is this server's, its Origin, where a browser tells one, is the served page's own, and its address holds a secret;
+Host is this server's, its Origin, where a browser sends one, is the served page's own, and its address holds a secret;
 browsers keep the secret as a cookie of this origin, which no other page can read or send.
 """
 

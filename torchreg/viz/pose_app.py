@@ -56,13 +56,7 @@ class PoseApp(Page):
         port: to listen on at 127.0.0.1, or a later one if it is taken.
     """
 
-    def __init__(
-        self,
-        editor: PoseEditor,
-        *,
-        output: str | Path = "posed",
-        port: int = 8080,
-    ) -> None:
+    def __init__(self, editor: PoseEditor, *, output: str | Path = "posed", port: int = 8080) -> None:
         self.editor = editor
         self._output = Path(output)
         super().__init__("torchreg pose", port)

@@ -50,10 +50,7 @@ def depth_colors(values: Tensor, lowest: float, highest: float) -> Tensor:
 def picture_with_points(
     image: Tensor, pixels: Tensor, inliers: Tensor, outline: Tensor | None = None, *, radius: int = 1
 ) -> Tensor:
-    """Return a faded picture (H, W, 3) with points, inliers blue and others red, and an outline in green.
-
-    Pixels (N, 2) are (column, row); those outside the picture and NaN are omitted. The radius of a point is in pixels.
-    """
+    """Return a faded picture (H, W, 3) with points at pixels (N, 2), inliers blue, others red; outline green."""
     drawn = image.unsqueeze(-1).expand(*image.shape, 3) if image.ndim == 2 else image
     drawn = 1 - _OVERLAY.contrast * (1 - drawn.float())
     if outline is not None:
@@ -74,10 +71,7 @@ def picture_with_points(
 
 
 def model_mask(mesh: TriangleMesh, camera: Camera) -> Tensor:
-    """Return the mask (H, W) of a mesh in a camera's picture; empty if a part of it is not in front of the camera.
-
-    Parts that only the distortion of the lens brings into the picture are missing.
-    """
+    """Return the mask (H, W) of a mesh in a camera's picture; empty if a part of it is not in front of the camera."""
     if bool((camera.project(mesh.vertices)[1] <= 0).any()):
         return torch.zeros(camera.height, camera.width, dtype=torch.bool)
     focal, center = camera.intrinsics.split(2)
@@ -136,10 +130,7 @@ def hull_sheet(masks: Sequence[Tensor], cameras: CameraRig, mesh: TriangleMesh, 
 
 
 class StereoPictures:
-    """Writes two pictures of every tracked frame: disparity_0000.png, and frame_0000.png with the points.
-
-    In the second, inliers are blue, and the outline of the shape in its pose is green.
-    """
+    """Writes two pictures of every tracked frame: disparity, and points, inliers blue, with the shape's outline."""
 
     def __init__(self, frames: StereoFrames, skin: LinearBlendSkin, folder: Path) -> None:
         self._frames, self._skin, self._faces, self._folder = frames, skin, faces_of(skin), folder

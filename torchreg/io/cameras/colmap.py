@@ -18,22 +18,16 @@ from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, local_pa
 
 # Per model the indices of fx, fy, cx, cy, and then k1, k2, p1, p2, k3, k4, k5, k6 among its parameters; None is zero.
 _MODELS: dict[str, tuple[int | None, ...]] = {
-    "SIMPLE_PINHOLE": (0, 0, 1, 2),
-    "PINHOLE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, None, None, None),
-    "RADIAL": (0, 0, 1, 2, 3, 4, None, None),
-    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "SIMPLE_PINHOLE": (0, 0, 1, 2), "PINHOLE": (0, 1, 2, 3), "SIMPLE_RADIAL": (0, 0, 1, 2, 3, None, None, None),
+    "RADIAL": (0, 0, 1, 2, 3, 4, None, None), "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
-}
+}  # fmt: skip
 # COLMAP's pixel coordinates start at the corner of the picture, ours at the middle of the first pixel.
 _CORNER = 0.5
 
 
 def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> CameraRig:
-    """Return the cameras of a COLMAP text model, one per image and named after it, in the order of ``images.txt``.
-
-    Lengths keep COLMAP's unit, which is arbitrary unless the model was scaled to metres.
-    """
+    """Return the cameras of a COLMAP text model, one per image in the order of ``images.txt``, in COLMAP's unit."""
     directory = local_path(folder)
     lenses = _lenses(directory / "cameras.txt", limits)
     path = directory / "images.txt"
@@ -135,7 +129,7 @@ def _images(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
 
 
 def _is_image(line: str) -> bool:
-    """Return whether a line tells of an image: two whole numbers at their places, and not points in triples."""
+    """Return whether a line describes an image: two whole numbers at their places, and not points in triples."""
     words = line.split()
     if len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
         return False

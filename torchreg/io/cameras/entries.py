@@ -104,13 +104,13 @@ def depth_unit(given: Mapping[str, Any], where: str) -> float | None:
     # Beside depths a scale is one of the picture.
     known = {name: unit for name, unit in units.items() if name != "scale" or unit <= 0.01}
     if known and max(known.values()) > 1.01 * min(known.values()):
-        told = ", ".join(f"{name} {given[name]}" for name in known)
-        raise FormatError(f"{where}: holds {told}, which are not the same unit of depth; keep one")
+        listed = ", ".join(f"{name} {given[name]}" for name in known)
+        raise FormatError(f"{where}: holds {listed}, which are not the same unit of depth; keep one")
     return next(iter(known.values()), None)
 
 
 def _metres(given: Mapping[str, Any], name: str, where: str) -> float:
-    """Return the metres per unit that an entry tells: a number, its inverse or a word."""
+    """Return the metres per unit of an entry: a number, its inverse or a word."""
     word = str(given[name]).strip().lower()
     if word.removesuffix("s") in _UNIT_WORDS:
         return _UNIT_WORDS[word.removesuffix("s")]
@@ -120,7 +120,7 @@ def _metres(given: Mapping[str, Any], name: str, where: str) -> float:
     number = float(value)
     if not 0 < number < np.inf:
         raise FormatError(f"{where}: {name} must be positive, got {number:g}")
-    # Open3D's recorders write units per metre; what depth_scale means elsewhere, depth images tell.
+    # Open3D's recorders write units per metre; depth images decide what depth_scale means elsewhere.
     if name == "depth_scale" and "intrinsic_matrix" not in given:
         return number
     if number != 1 and (number > 1) != _DEPTHS[name] and name not in ("scale", "depth_scale"):
@@ -193,7 +193,7 @@ def _add_pose(entry: dict[str, Any], given: Mapping[str, Any], where: str) -> No
 
 
 def _add_projection(entry: dict[str, Any], given: Mapping[str, Any], where: str) -> None:
-    """Add what ROS's P and R tell: the place of a camera of a stereo pair, and the numbers of a rectified picture.
+    """Add what ROS's P and R hold: the place of a camera of a stereo pair, and the numbers of a rectified picture.
 
     As in ROS's image_geometry, K and D are those of the raw picture, which R turns to the rectified one of P; a picture
     whose D is zero is rectified. P[0, 3] is -fx times the distance to the right of the left camera, metres.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import textwrap
@@ -23,7 +22,7 @@ from torchreg.io.atomic import write_atomic
 from torchreg.io.cameras.entries import MATRICES, cameras_of
 from torchreg.io.cameras.lenses import check_lens
 from torchreg.io.file_format import plain_text
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.limits import FileLimits, local_path
 
 _KEY = re.compile(r"^([A-Za-z_][\w.]*):[ \t]*(.*)$", re.MULTILINE)
 _FIELD = re.compile(r"^[ \t]+(rows|cols|dt|data):[ \t]*", re.MULTILINE)
@@ -43,43 +42,16 @@ _WIDTHS, _HEIGHTS, _SIZES = ("image_width", "width"), ("image_height", "height")
 Values = dict[str, "Tensor | str | Values"]
 
 
-def load_opencv(
-    path: str | os.PathLike[str],
-    *,
-    size: tuple[int, int] | None = None,
-    unit: float = 1.0,
-    limits: FileLimits = DEFAULT_LIMITS,
-) -> CameraRig:
-    """Return the camera, or the stereo pair left and right, of an OpenCV YAML file.
+def read_opencv(content: bytes, file: Path, _: FileLimits) -> CameraRig:
+    """Return the camera, or the stereo pair left and right, in the bytes of an OpenCV YAML file, float64.
 
-    A pair has ``M1 D1 M2 D2 R T`` (or ``cameraMatrix1 distCoeffs1 ...``, ``K1 ...``), where R and T map coordinates of
-    the left camera to the right one; the left one is at the origin. One camera has ``camera_matrix`` and
-    ``distortion_coefficients`` (or ``cameraMatrix distCoeffs``, ``K D``), and maybe R and T from the world. ROS's files
-    have ``K D R P``: the world is then that of the rectified pictures of the left camera. Kalibr's chains of cameras
-    and ORB-SLAM's settings are read as well.
-
-    Args:
-        path: the file.
-        size: (width, height) of the pictures, for files without ``image_width`` and ``image_height``.
-        unit: metres per unit of T, which is that of the calibration board, often 0.001.
-        limits: ``max_bytes`` applies.
-
-    Returns:
-        The cameras, float64.
+    A pair has ``M1 D1 M2 D2 R T``, whose R and T map coordinates of the left camera, at the origin, to the right one;
+    one camera has ``camera_matrix`` and ``distortion_coefficients``, and maybe R and T from the world. ROS's files have
+    ``K D R P``; Kalibr's chains and ORB-SLAM's settings are read as well.
     """
-    if not (math.isfinite(unit) and unit > 0):
-        raise InputError(f"unit must be positive and finite, got {unit}")
-    file = local_path(path)
-    return read_opencv(read_bytes(file, limits), file, limits, size=size, unit=unit)
-
-
-def read_opencv(
-    content: bytes, file: Path, _: FileLimits, *, size: tuple[int, int] | None = None, unit: float = 1.0
-) -> CameraRig:
-    """Return the cameras in the bytes of a file; see `load_opencv`."""
     values = _parsed(_text(content, file), file)
     if _is_opencvs(values):
-        return read_opencv_values(values, file, size=size, unit=unit)
+        return read_opencv_values(values, file)
     try:
         return CameraRig(tuple(cameras_of(_as_object(values), str(file))))
     except InputError as error:
@@ -136,13 +108,11 @@ def _number(word: str) -> str | int | float:
         return word
 
 
-def read_opencv_values(
-    values: Values, file: Path, *, size: tuple[int, int] | None = None, unit: float = 1.0
-) -> CameraRig:
+def read_opencv_values(values: Values, file: Path) -> CameraRig:
     """Return the cameras of named matrices."""
-    width, height = _picture_size(values, size, file)
+    width, height = _picture_size(values, file)
     try:
-        return CameraRig(tuple(_cameras(values, width, height, unit, file)))
+        return CameraRig(tuple(_cameras(values, width, height, file)))
     except InputError as error:
         raise FormatError(f"{file}: {error}") from error
 
@@ -163,12 +133,7 @@ def values_of(document: Mapping[str, Any]) -> Values:
 
 
 def save_opencv(path: str | os.PathLike[str], cameras: CameraRig) -> None:
-    """Write one camera, or two as a pair, for OpenCV to read; metres, the left camera of a pair at the origin.
-
-    Args:
-        path: a ``.yml`` or ``.yaml`` file; its folder must exist.
-        cameras: one or two, with pictures of one size.
-    """
+    """Write one camera, or two as a pair, for OpenCV to read; metres, the left camera of a pair at the origin."""
     if len(cameras) > 2 or len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise InputError(f"OpenCV files hold one or two cameras with pictures of one size, got {len(cameras)}")
     first, last = cameras[0], cameras[len(cameras) - 1]
@@ -261,23 +226,21 @@ def _after_brackets(text: str) -> list[int]:
     return [mark.end() for mark in re.finditer(r"\]", text)]
 
 
-def _picture_size(values: Values, size: tuple[int, int] | None, path: Path) -> tuple[int, int]:
+def _picture_size(values: Values, path: Path) -> tuple[int, int]:
     pair = next((values[name] for name in _SIZES if name in values), None)
     if isinstance(pair, Tensor) and pair.numel() == 2:
         return int(pair.flatten()[0]), int(pair.flatten()[1])
     sides = [next((values[name] for name in names if name in values), None) for names in (_WIDTHS, _HEIGHTS)]
     if all(isinstance(side, str) and _is_count(side) for side in sides):
         return int(str(sides[0])), int(str(sides[1]))
-    if size is None:
-        raise FormatError(
-            f"{path}: lacks image_width and image_height; write them into the file, as in `image_width: 640` and "
-            f"`image_height: 480`, below its first lines"
-        )
-    return size
+    raise FormatError(
+        f"{path}: lacks image_width and image_height; write them into the file, as in `image_width: 640` and "
+        f"`image_height: 480`, below its first lines"
+    )
 
 
-def _cameras(values: Values, width: int, height: int, unit: float, path: Path) -> list[Camera]:
-    motion = _motion(values, unit, path)
+def _cameras(values: Values, width: int, height: int, path: Path) -> list[Camera]:
+    motion = _motion(values, path)
     for names in PAIRS:
         if names[0] in values:
             if motion is None:
@@ -315,11 +278,11 @@ def _lens(values: Values, names: tuple[str, ...], width: int, path: Path) -> tup
     return matrix[[0, 1, 0, 1], [0, 1, 2, 2]], flat if len(flat) > 1 else flat[:0]
 
 
-def _motion(values: Values, unit: float, path: Path) -> Tensor | None:
+def _motion(values: Values, path: Path) -> Tensor | None:
     if "T" not in values and "R" not in values:
         return None
     turn, step = values.get("R"), values.get("T")
     if not isinstance(turn, Tensor) or not isinstance(step, Tensor) or step.numel() != 3 or turn.numel() not in (3, 9):
         raise FormatError(f"{path}: R must be a 3 x 3 matrix or a rotation vector, and T a vector of 3")
     rotation = so3_exp(turn.flatten()) if turn.numel() == 3 else turn.reshape(3, 3)
-    return rigid_matrix(rotation, unit * step.flatten())
+    return rigid_matrix(rotation, step.flatten())

@@ -1,4 +1,4 @@
-"""The formats of point clouds and meshes, and how their content is told."""
+"""The formats of point clouds and meshes, and how their content is recognized."""
 
 from __future__ import annotations
 

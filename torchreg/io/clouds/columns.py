@@ -36,7 +36,7 @@ _UNIT = re.compile(r"[\[(][^\])]*[\])]|_(m|mm|cm)$")
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Thresholds by which columns without names are told."""
+    """Thresholds by which columns without names are recognized."""
 
     unit_length: float = 0.02  # of normals, from one: they are often written with two digits
     share: float = 0.99  # of rows that must agree; a few may be damaged
@@ -69,7 +69,7 @@ def have_decimal_commas(fields: Iterable[bytes]) -> bool:
 
 
 def names_points(names: Sequence[str]) -> bool:
-    """Return whether the names of columns tell where x, y and z are."""
+    """Return whether the names of columns say where x, y and z are."""
     return named_columns(names, "points") is not None
 
 
@@ -81,11 +81,8 @@ def wanted_columns(names: Sequence[str]) -> list[int]:
 def cloud_of_columns(table: Array, names: Sequence[str] | None = None, *, intensity_first: bool = False) -> RawCloud:
     """Return the cloud in a table (N, C): x y z and, where they are there, normals and colors.
 
-    Args:
-        table: numbers.
-        names: of the columns; None where the file has none. Then x y z come first, and what follows is told by its
-            numbers: unit vectors are normals, whole numbers up to 255 (or 65535) or numbers from 0 to 1 are colors.
-        intensity_first: whether an intensity stands before colors where both orders are possible, as in .pts files.
+    Without names x y z come first; unit vectors are normals, whole numbers up to 255 (or 65535) or numbers from 0 to 1
+    colors. An intensity may stand before colors where both orders are possible, as in .pts files.
     """
     if names is not None:
         where = {kind: named_columns(names, kind) for kind in _NAMES}
@@ -107,7 +104,7 @@ def cloud_of_columns(table: Array, names: Sequence[str] | None = None, *, intens
 
 
 def _guessed(table: Array, intensity_first: bool) -> dict[str, list[int] | None]:
-    """Return the columns of normals and of colors behind x y z, told by their numbers."""
+    """Return the columns of normals and of colors behind x y z, recognized by their numbers."""
     width = table.shape[1] if len(table) else 0
     begins = range(3, width - 2)
     normals = next((k for k in begins if are_normals(table[:, k : k + 3])), None)
@@ -129,9 +126,9 @@ def _guessed(table: Array, intensity_first: bool) -> dict[str, list[int] | None]
 def are_normals(columns: Array) -> bool:
     """Return whether nearly all rows (N, 3) that are finite and not zero are of length one."""
     length = np.linalg.norm(columns, axis=-1)
-    told = np.isfinite(length) & (length > 0)
+    directed = np.isfinite(length) & (length > 0)
     unit = np.abs(length - 1) < _EVIDENCE.unit_length
-    return bool(told.any() and (unit & told).sum() >= _EVIDENCE.share * told.sum())
+    return bool(directed.any() and (unit & directed).sum() >= _EVIDENCE.share * directed.sum())
 
 
 def _are_colors(columns: Array) -> bool:

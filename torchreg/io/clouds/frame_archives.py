@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from torchreg.errors import FileWarning, FormatError
+from torchreg.errors import FormatError
 from torchreg.io.clouds.columns import are_normals
 from torchreg.io.clouds.npz import ARCHIVE_START, ARRAY_START, FACES, POINTS, array_of, read_npy_header, triangles_of
 from torchreg.io.clouds.raw_cloud import Array, as_indices, not_measured
-from torchreg.io.file_format import check_stand_in, naming
+from torchreg.io.file_format import check_stand_in, naming, warn
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_allowed, check_budget, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
 
@@ -73,9 +72,7 @@ def _measured(frames: list[Array]) -> list[Array]:
     count, concerned = sum(map(len, frames)), sum(map(bool, missing))
     if sum(missing) == count:
         raise FormatError(f"all of its {count} points are 0 0 0: nothing was measured")
-    warnings.warn(
-        not_measured(sum(missing), count, f" in {concerned} of {len(frames)} frames"), FileWarning, stacklevel=2
-    )
+    warn(not_measured(sum(missing), count, f" in {concerned} of {len(frames)} frames"))
     return [frame[rows] for frame, rows in zip(frames, measured, strict=True)]
 
 
@@ -113,10 +110,7 @@ def _frames_in(archive: zipfile.ZipFile) -> FrameArchive | None:
 
 
 def _numbered(shapes: dict[str, tuple[int, ...]]) -> list[str]:
-    """Return the names of arrays that number the frames, in their order: frame_0, frame_1, ...
-
-    As numpy calls those of a list arr_0, arr_1, ..., any other name will do if there is one such sequence of (M, 3).
-    """
+    """Return the names of arrays that number frames (frame_0, ...; numpy: arr_0, ...), in order, of (M, 3) each."""
     sequences = dict[str, dict[int, str]]()
     for key in shapes:
         if match := _NUMBERED.fullmatch(key):

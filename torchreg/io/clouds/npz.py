@@ -90,13 +90,13 @@ def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
     check_allowed(len(points) if points.ndim else 0, "points", limits)
     if points.ndim == 3 and points.shape[2] == 3:
         raise FormatError(f"{key} has the shape {points.shape}, several clouds; load_frames reads it as a sequence")
-    told = _with_columns(points) if points.ndim == 2 and points.shape[1] > 3 else RawCloud(points)
+    cloud = _with_columns(points) if points.ndim == 2 and points.shape[1] > 3 else RawCloud(points)
     faces = arrays.get(corners)
     if faces is not None:
         check_allowed(len(faces) if faces.ndim else 0, "faces", limits)
         faces = triangles_of(faces)
-    normals, colors = arrays.get("normals", told.normals), arrays.get("colors", told.colors)
-    return RawCloud(told.points, normals, colors, faces)
+    normals, colors = arrays.get("normals", cloud.normals), arrays.get("colors", cloud.colors)
+    return RawCloud(cloud.points, normals, colors, faces)
 
 
 def triangles_of(faces: Array) -> Array:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import warnings
 
 import numpy as np
 
-from torchreg.errors import FileWarning, FormatError
+from torchreg.errors import FormatError
 from torchreg.io.clouds.columns import typed_colors
 from torchreg.io.clouds.raw_cloud import Array, RawCloud, not_measured, parse_numbers
-from torchreg.io.file_format import plain_text
+from torchreg.io.file_format import plain_text, warn
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_allowed, check_budget
 
 _NUMBER = rb"[-+.\deE]{1,40}"
@@ -91,12 +90,10 @@ def _cloud(points: list[Array], colors: list[Array | None], count: int) -> RawCl
     if count and not len(found):
         raise FormatError(f"all of its {count} points are 0 0 0: nothing was measured")
     if len(found) < count:
-        warnings.warn(not_measured(count - len(found), count), FileWarning, stacklevel=2)
+        warn(not_measured(count - len(found), count))
     known = [values for values in colors if values is not None]
     if not known or len(known) < len(colors):
         if known:
-            warnings.warn(
-                f"colors are left out: {len(known)} of {len(colors)} scans have them", FileWarning, stacklevel=2
-            )
+            warn(f"colors are left out: {len(known)} of {len(colors)} scans have them")
         return RawCloud(found)
     return RawCloud(found, colors=typed_colors(np.concatenate(known)))

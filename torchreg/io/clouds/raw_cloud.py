@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchreg.errors import FileWarning, FormatError
+from torchreg.errors import FormatError
+from torchreg.io.file_format import warn
 
 Array = NDArray[Any]
 
@@ -29,7 +30,7 @@ class RawCloud:
 
 
 def not_measured(missing: int, count: int, where: str = "") -> str:
-    """Return the sentence that tells of rows that are left out, as depth cameras and padding leave them."""
+    """Return the sentence about rows that are left out, as depth cameras and padding leave them."""
     return f"{missing} of {count} points{where} are 0 0 0, where nothing was measured; they are left out"
 
 
@@ -125,9 +126,7 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
     """Return the (F, 3) triangles of polygons of ``counts`` (P,) corners, cut as fans; warn of those of under 3."""
     small = int(np.count_nonzero(counts < 3))
     if small:
-        warnings.warn(
-            f"{small} of {len(counts)} faces are left out: they have fewer than 3 corners", FileWarning, stacklevel=2
-        )
+        warn(f"{small} of {len(counts)} faces are left out: they have fewer than 3 corners")
     before = start = 0
     result = np.empty((int(np.maximum(counts - 2, 0).sum()), 3), indices.dtype)
     # A part after the other, as numbers of corners take more memory than corners.

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
 
-from torchreg.errors import FileWarning, FormatError
+from torchreg.errors import FormatError
 from torchreg.io.clouds.columns import cloud_of_columns, have_decimal_commas, names_points, wanted_columns
 from torchreg.io.clouds.raw_cloud import Array, RawCloud, as_indices, fan_triangles, parse_numbers, parse_table
-from torchreg.io.file_format import plain_text
+from torchreg.io.file_format import plain_text, warn
 from torchreg.io.limits import FileLimits, check_allowed
 
 _COMMENT = re.compile(rb"(#|//).*")
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _FIELDS = re.compile(rb"[;\s]+")
-# Lines by which the separator is told.
+# Lines that decide on the separator.
 _TOLD_BY = 50
 
 
@@ -233,9 +232,7 @@ def _vertex_table(rows: list[bytes]) -> Array:
     widths = np.array([len(row.split()) for row in rows])
     colored = widths >= 6
     if colored.any() and not colored.all() and np.isin(widths, (3, 4, 6, 7)).all():
-        warnings.warn(
-            f"colors are left out: {int(colored.sum())} of {len(rows)} vertices have one", FileWarning, stacklevel=2
-        )
+        warn(f"colors are left out: {int(colored.sum())} of {len(rows)} vertices have one")
         rows = [b" ".join(row.split()[:3]) for row in rows]
     table = parse_table(rows, None, "vertex")
     if len(table) and table.shape[1] not in (3, 4, 6, 7):

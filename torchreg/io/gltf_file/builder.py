@@ -46,12 +46,9 @@ class GltfBuilder:
         self.gltf.bufferViews.append(view)
         width = 1 if values.ndim == 1 else values.shape[1]
         accessor = pygltflib.Accessor(
-            bufferView=len(self.gltf.bufferViews) - 1,
-            byteOffset=0,
-            componentType=_COMPONENTS[values.dtype],
-            count=len(values),
-            type=_TYPES[width],
-        )
+            bufferView=len(self.gltf.bufferViews) - 1, byteOffset=0, componentType=_COMPONENTS[values.dtype],
+            count=len(values), type=_TYPES[width],
+        )  # fmt: skip
         if bounds:
             rows = values.reshape(len(values), width)
             accessor.min, accessor.max = rows.min(0).tolist(), rows.max(0).tolist()

@@ -40,10 +40,7 @@ def pose_nodes(document: GltfDocument, time: float | None, frame: int | None) ->
 
 
 def moved_nodes(document: GltfDocument) -> dict[int, set[str]]:
-    """Return the nodes that a clip turns or slides, with "rotation" and "translation" for what it does.
-
-    Programs write tracks for nodes that stand still, too; these do not count.
-    """
+    """Return the nodes that a clip turns ("rotation") or slides ("translation"), without tracks that stand still."""
     found = dict[int, set[str]]()
     for clip in document.items("animations"):
         samplers = document.entry(clip, "samplers", list)

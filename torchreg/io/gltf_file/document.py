@@ -42,10 +42,7 @@ _COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
 class GltfDocument:
-    """The JSON and the buffers of a glTF file, with every index, size and number checked when it is used.
-
-    Errors do not name the file; callers add it.
-    """
+    """The JSON and the buffers of a glTF file, checked where they are used; callers add the file's name to errors."""
 
     def __init__(self, content: bytes, path: Path, limits: FileLimits) -> None:
         text, self._binary = _open_container(content) if content[:4] == b"glTF" else (content, None)

@@ -191,10 +191,7 @@ def _vertices(document: GltfDocument, primitive: dict[str, Any], instance: _Inst
 
 
 def _blended(document: GltfDocument, attributes: Mapping[str, Any], skin: Array, count: int) -> Array | None:
-    """Return the matrix (V, 4, 4) of every vertex under a skin (J, 4, 4), None where nothing says which joints move it.
-
-    Weights are divided by their sum; a vertex without any follows its first joint, as in three.js.
-    """
+    """Return the matrix (V, 4, 4) of every vertex under a skin (J, 4, 4); without weights the first joint moves it."""
     blend, total, number = np.zeros((count, 4, 4)), np.zeros(count), 0
     first = np.zeros(count, np.int64)
     while attributes.get(f"JOINTS_{number}") is not None and len(skin):

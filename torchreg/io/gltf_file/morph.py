@@ -29,23 +29,10 @@ def save_vertex_animation(
     path: str | Path, frames: Tensor, faces: Tensor, times: Tensor, colors: Tensor | None = None,
     *, up: Direction | None = None,
 ) -> Path:  # fmt: skip
-    """Return the path of a .glb file with a mesh whose vertices move freely, in straight lines from frame to frame.
+    """Write a mesh whose vertices (T, V, 3) move straight from frame to frame as a .glb file; return its path.
 
-    Motions that no skeleton gives, such as blends of dual quaternions, play exactly in any glTF viewer. The first frame
-    is the mesh, the others are morph targets, of which the animation mixes two at a time.
-
-    Args:
-        path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.
-        frames: (T, V, 3), at least two.
-        faces: (F, 3) integers.
-        times: (T,) seconds, not negative, strictly increasing.
-        colors: (V, 3) or (V, 4) in [0, 1].
-        up: the axis that is upright, turned to glTF's y; left as it is by default.
-
-    Returns:
-        The path written.
-
-    References: the glTF 2.0 specification, section 3.7.2.2, on morph targets.
+    The first frame is the mesh, the others are morph targets, of which the animation mixes two at a time: glTF 2.0,
+    section 3.7.2.2. Times (T,) are seconds, strictly increasing.
     """
     target = checked_path(path)
     moving = as_float_tensor(frames, "frames")

@@ -8,9 +8,10 @@ import numpy as np
 
 from torchreg.errors import ModelError
 from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.file_format import warn
 from torchreg.io.gltf_file.clip import moved_nodes
 from torchreg.io.gltf_file.document import GltfDocument
-from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface, warn
+from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface
 from torchreg.io.gltf_file.skins import Skeleton, ancestors, shown_nodes, unique_names
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_budget
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from torchreg.errors import ModelError
 from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.file_format import warn
 from torchreg.io.gltf_file.document import GltfDocument
-from torchreg.io.gltf_file.primitives import warn
 from torchreg.io.gltf_file.skins import SKIN_TOLERANCES, Skeleton, Skin, ancestors
 
 

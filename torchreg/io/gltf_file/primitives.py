@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchreg.errors import FileWarning, FormatError, ModelError
+from torchreg.errors import FormatError, ModelError
 from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.file_format import warn
 from torchreg.io.gltf_file.document import GltfDocument, Mode, triangles
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 
@@ -78,11 +78,6 @@ class VertexBudget:
                 f"{self.vertices} vertices with {self.joints} joints; at most {self.limits.max_points} vertices "
                 f"(FileLimits.max_points) and {most} weights are read"
             )
-
-
-def warn(message: str) -> None:
-    """Say what was left out or put right; `naming` adds the file."""
-    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def numbers(document: GltfDocument, index: Any, what: str, shape: str) -> Array:

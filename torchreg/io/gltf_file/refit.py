@@ -38,7 +38,7 @@ class _Rounding:
     """Rounding of positions in single precision."""
 
     position: float = 1e-6  # of the skeleton's extent: shorter bones have no direction
-    turn: float = 1e-3  # of a bone's length, by which its end may lie beside its old direction
+    turn: float = 1e-3  # of a bone's length, by which its end may deviate from its old direction
 
 
 _ROUNDING = _Rounding()
@@ -67,17 +67,10 @@ def save_refitted_rig(
     every clip, are multiplied by ``l' / l``. Those of the root are by the ratio of the joints' distances from it, so
     that feet stay on the ground. Normals and tangents turn as the surface does. Morph targets and what hangs on joints
     without being skinned, as a tool in a hand, keep their size.
-
-    Args:
-        path: where to write; the suffix must be .glb.
-        source: the rigged .glb or .gltf file.
-        vertices: (V, 3) in the bind pose, in the order of `load_rig`, metres.
-        positions: (3,) of each joint in the bind pose by its name, metres.
-        skin: name or index of the one skin, as given to `load_rig`; all by default.
     """
     target, file = checked_path(path), local_path(source)
     with warnings.catch_warnings(), naming(file):
-        warnings.simplefilter("ignore", FileWarning)  # what reading the rig told before
+        warnings.simplefilter("ignore", FileWarning)  # what was warned of when the rig was read
         rig = load_rig(file, skin=skin)
         document = GltfDocument(read_bytes(file, DEFAULT_LIMITS), file, DEFAULT_LIMITS)
         if set(positions) != set(rig.joint_names) or len(vertices) != len(rig.vertices):
@@ -165,7 +158,7 @@ class _Rewriter:
         return {key: view[key] for key in ("name", "byteStride", "target") if key in view} | placed
 
     def _embed_pictures(self) -> None:
-        """Take pictures beside the file into it; where one is not there, its address stays."""
+        """Embed pictures that are separate files; where one is not there, its address stays."""
         for image in self.document.items("images"):
             uri = image.get("uri")
             if not isinstance(uri, str) or uri.startswith("data:"):

@@ -11,8 +11,9 @@ import numpy as np
 
 from torchreg.errors import FormatError, ModelError
 from torchreg.io.clouds.raw_cloud import Array
+from torchreg.io.file_format import warn
 from torchreg.io.gltf_file.document import GltfDocument, parents_first
-from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface, warn
+from torchreg.io.gltf_file.primitives import Surface, VertexBudget, read_surface
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 
 
@@ -134,7 +135,7 @@ def _choose_skins(document: GltfDocument, mesh: str | int | None, skin: str | in
 
 
 def shown_nodes(document: GltfDocument) -> set[int]:
-    """Return the nodes of the default scene; all nodes where no scene is told."""
+    """Return the nodes of the default scene; all nodes where there is no scene."""
     scenes = document.items("scenes")
     number = document.json.get("scene", 0)
     if not scenes or not isinstance(number, int) or not 0 <= number < len(scenes):
@@ -203,17 +204,17 @@ def _shared_joints(
 def unique_names(names: Sequence[Any]) -> list[str]:
     """Return names that all differ: a repeated one gets ``#`` and its index."""
     taken = {str(name) for name in names if name}
-    unique, told = list[str](), list[str]()
+    unique, renamed = list[str](), list[str]()
     for index, name in enumerate(names):
         text = str(name) if name else f"joint_{index}"
         if text in unique or (not name and text in taken):
             tries = (f"{text}#{index}" + "'" * more for more in itertools.count())
-            told.append(f"{text!r} (number {index}) is called {(new := next(t for t in tries if t not in taken))!r}")
+            renamed.append(f"{text!r} (number {index}) is called {(new := next(t for t in tries if t not in taken))!r}")
             text = new
         taken.add(text)
         unique.append(text)
-    if told:
-        warn(f"{len(told)} joints have the name of another and are told apart: {'; '.join(told[:3])}")
+    if renamed:
+        warn(f"{len(renamed)} joints have the name of another and are told apart: {'; '.join(renamed[:3])}")
     return unique
 
 
@@ -245,12 +246,7 @@ def ancestors(node: int, parents: Sequence[int]) -> Iterator[int]:
 
 
 def bind_transforms(
-    document: GltfDocument,
-    skin: int,
-    names: Sequence[str],
-    weights: Array,
-    world: Array,
-    parents: Sequence[int],
+    document: GltfDocument, skin: int, names: Sequence[str], weights: Array, world: Array, parents: Sequence[int]
 ) -> Array:
     """Return the transforms (J, 4, 4) of a skin's joints in the bind pose.
 

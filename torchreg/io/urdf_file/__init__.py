@@ -1,1 +1,1 @@
-"""Inside of robot descriptions: the record of a robot, its units, and the file written back."""
+"""Inside of robot descriptions: XML, the record of a robot, its meshes and units, and the file written back."""

@@ -20,7 +20,7 @@ from torchreg.io.urdf_file.record import UrdfRecord
 class _Plausible:
     """What robots are like, large ones as well; all lengths in metres."""
 
-    least: float = 3.0  # lengths below are never told, as those of household robots
+    least: float = 3.0  # lengths below are never reported, as those of household robots
     link: float = 20.0  # a link over the longest step between joints; inches make 39 of it
     longest: float = 1.8  # the largest link over that step, in the median of 60 robots
     thin: float = 0.1  # its thinnest side over that step: grounds and walls are large and thin

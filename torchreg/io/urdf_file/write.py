@@ -15,7 +15,7 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import local_path, read_bytes
-from torchreg.io.strict_xml import parse_lenient_xml
+from torchreg.io.urdf_file.strict_xml import parse_lenient_xml
 
 # Limits of effort and velocity, which the format asks for, where nothing is known.
 _UNKNOWN = {"effort": "1", "velocity": "1"}
@@ -24,15 +24,7 @@ _UNKNOWN = {"effort": "1", "velocity": "1"}
 def save_urdf(
     path: str | os.PathLike[str], name: str, tree: KinematicTree, links: Sequence[str], meshes: Sequence[TriangleMesh]
 ) -> None:
-    """Write a robot: PATH.urdf, and beside it a folder PATH_meshes with an STL file for each link.
-
-    Args:
-        path: of the .urdf file.
-        name: of the robot.
-        tree: one frame a link, whose offsets do not turn; no joint mimics another.
-        links: names of the links, in the order of the tree's frames.
-        meshes: of the links in their frames, metres; links without faces get none.
-    """
+    """Write a robot, each frame a link, and beside it PATH_meshes with an STL file for each link that has faces."""
     file = local_path(path)
     if file.suffix.lower() != ".urdf":
         raise FormatError(f"{file} must end in .urdf")
@@ -57,15 +49,7 @@ def save_urdf(
 def save_urdf_with_camera(
     path: str | os.PathLike[str], source: str | os.PathLike[str], parent: str, camera: str, placed: torch.Tensor
 ) -> None:
-    """Write a robot's file again with a camera: a link without geometry and a fixed joint, named after it.
-
-    Args:
-        path: of the new .urdf file; names of meshes relative to the old one are changed to fit.
-        source: of the robot.
-        parent: link that carries the camera.
-        camera: name of its link, whose axes are those of a picture: right, down, forward.
-        placed: (4, 4) ``T_parent_camera``, metres.
-    """
+    """Write a robot's file again with a camera link, fixed to ``parent`` at ``T_parent_camera`` (4, 4), metres."""
     file, given = local_path(path), local_path(source)
     if file.suffix.lower() != ".urdf":
         raise FormatError(f"{file} must end in .urdf")

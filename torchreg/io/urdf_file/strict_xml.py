@@ -85,7 +85,7 @@ def parse_lenient_xml(content: bytes) -> ET.Element:
 
 
 def _blank_lines(comment: re.Match[bytes]) -> bytes:
-    """Return as many lines as a comment has, so that messages tell the right one."""
+    """Return as many lines as a comment has, so that messages name the right one."""
     return b"\n" * comment.group().count(b"\n")
 
 

@@ -16,25 +16,19 @@ import torch
 
 from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
-from torchreg.io.file_format import check_stand_in
+from torchreg.io.file_format import check_stand_in, warn
 from torchreg.io.limits import FileLimits, read_bytes
 from torchreg.io.points import PARSER_ERRORS, load_mesh
-from torchreg.io.strict_xml import parse_xml
+from torchreg.io.urdf_file.strict_xml import parse_xml
 
 # Elements of COLLADA files without which meshes are read.
 _MATERIALS = ("library_images", "library_effects", "library_materials", "bind_material")
 
 
 class MeshFiles:
-    """Finds and reads mesh files, each once.
+    """Finds and reads the mesh files of a description, each once; ``package://`` names in folders given and above it.
 
-    Args:
-        path: of the description.
-        package_dirs: folders to search for ``package://`` and ``model://`` names; those above the description are
-            searched as well.
-        require: whether it is an error if a file is missing or needs a reader that is not installed.
-        limits: largest size of a file.
-        warn: whether such files are told of where they are not required.
+    A file that is missing or needs a reader that is not installed is an error where it is required, else a warning.
     """
 
     def __init__(
@@ -85,11 +79,11 @@ class MeshFiles:
             return load_mesh(file, limits=self._limits, dtype=torch.float64)
 
     def _missing(self, error: FormatError | MissingExtraError) -> None:
-        """Raise the error about a file that is not there, or tell it, as was asked for."""
+        """Raise the error about a missing file, or warn, as was asked for."""
         if self._require:
             raise error
         if self._warn:
-            warnings.warn(f"{error}; it is left out", FileWarning, stacklevel=2)
+            warn(f"{error}; it is left out")
 
     def _candidates(self, filename: str) -> list[Path]:
         """Return the possible paths of a mesh, most likely first."""
