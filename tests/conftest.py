@@ -29,7 +29,7 @@ PARTS = {
 # Long runs of everything together. Tracing slows them most, and their parts have tests of their own, which are traced.
 UNTRACED = {
     "benchmarks", "docs", "experiments", "web", "test_align_scans.py", "test_bad_input.py", "test_calibrate.py",
-    "test_clouds.py", "test_compiled_shapes.py", "test_default_dtypes.py", "test_degenerate_data.py", "test_descent.py",
+    "test_clouds.py", "test_compiled_shapes.py", "test_contracts.py", "test_degenerate_data.py", "test_descent.py",
     "test_em_loss.py", "test_extract_spine.py", "test_far_coordinates.py", "test_find_pose.py", "test_loaded_data.py",
     "test_poses_from_skeletons.py", "test_prior.py", "test_search.py", "test_shapes_as_modules.py", "test_storage.py",
     "test_tip_correspondences.py", "test_track.py",

@@ -1,17 +1,14 @@
 """Data at one place, on a line or on a plane, are never called converged, and coarse rounding is told."""
 
-import copy
-
 import pytest
 import torch
 
 import torchreg as tr
+from tests import bodies
 from torchreg.errors import DegenerateDataWarning, InputError, PrecisionWarning
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.spread import spread_dimensions
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.shapes.primitives import Primitive
 
 QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100), num_samples=150)
 SEARCH = tr.FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1, num_model_points=60)
@@ -31,14 +28,7 @@ def cloud(request):
 
 @pytest.fixture(scope="module")
 def finger():
-    eye = torch.eye(4, dtype=torch.float64)
-    knuckle = eye.clone()
-    knuckle[2, 3] = 0.05
-    tree = KinematicTree((
-        Joint("body", -1, eye), Joint("finger", 0, knuckle, "revolute", (0.8, 0.6, 0.0), -0.5, 1.2)
-    ))  # fmt: skip
-    solids = [Primitive("ellipsoid", (0.05, 0.03, 0.06), eye), Primitive("ellipsoid", (0.012, 0.015, 0.04), eye)]
-    return tr.ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004)
+    return bodies.finger()
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7])
@@ -98,15 +88,8 @@ def test_a_flat_surface_has_a_note():
     assert tr.extract_spine([flat], workers=1).status is not tr.Status.CONVERGED
 
 
-def test_single_precision_far_away_is_told_and_double_is_exact(finger):
-    config = tr.AlignConfig(search="never")
-    near = tr.sample_skin(finger, 150)(finger.rest_pose()).detach()
-    offset = torch.tensor([1e4, -2e4, 1.5e4])
-    start = finger.rest_pose()
-    start[:3] = offset
+def test_single_precision_far_away_is_warned_of(finger):
+    near, start = tr.sample_skin(finger, 150)(finger.rest_pose()).detach(), finger.rest_pose()
+    start[:3] = torch.tensor([1e4, -2e4, 1.5e4])
     with pytest.warns(PrecisionWarning, match="float32 rounds to 0.0024.*compute in float64"):
-        tr.align(finger, near + offset, start, config=config)
-    exact = copy.deepcopy(finger).double()
-    here = tr.align(exact, near, finger.rest_pose().double(), config=config).keypoints
-    far = tr.align(exact, near.double() + offset.double(), start.double(), config=config).keypoints
-    torch.testing.assert_close(far - offset.double(), here, rtol=0, atol=1e-8)
+        tr.align(finger, near + start[:3], start, config=tr.AlignConfig(search="never"))
