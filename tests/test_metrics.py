@@ -191,14 +191,6 @@ def test_pck_counts():
         pck(predicted, target, 0.0)
 
 
-@given(st.integers(0, 1000), st.floats(0.1, 2.0), st.floats(1.0, 2.0))
-def test_pck_grows_with_the_threshold(seed, threshold, factor):
-    predicted, target = cloud(2, 5, seed=seed), cloud(2, 5, seed=seed + 1)
-    smaller, larger = pck(predicted, target, threshold), pck(predicted, target, threshold * factor)
-    assert bool((smaller <= larger).all())
-    assert bool(((smaller >= 0) & (larger <= 1)).all())
-
-
 # adjusted_rand
 
 
@@ -239,13 +231,6 @@ def test_adjusted_rand_is_symmetric_and_blind_to_names(pair):
     assert value == pytest.approx(adjusted_rand(second, first), abs=1e-12)
     assert value == pytest.approx(adjusted_rand(7 - 3 * first, second), abs=1e-12)
     assert adjusted_rand(first, 5 * first) == 1.0
-
-
-def test_adjusted_rand_of_chance_and_of_many_points():
-    generator = torch.Generator().manual_seed(0)
-    first, second = torch.randint(5, (2, 200_000), generator=generator)
-    assert abs(adjusted_rand(first, second)) < 1e-3
-    assert adjusted_rand(torch.zeros(10, dtype=torch.int64), torch.arange(10)) == 0.0
 
 
 def test_adjusted_rand_takes_lists_and_masks():

@@ -59,22 +59,6 @@ def test_every_extra_that_is_named_exists():
     assert named <= {*EXTRAS, "name"}
 
 
-def test_the_core_brings_no_viewer():
-    core = names(PROJECT["dependencies"])
-    assert "torch" in core
-    assert not core & {"viser", "plotly", "open3d", "pyvista", "sphinx", "playwright"}
-
-
-def test_the_tests_alone_bring_neither_ray_nor_arrow_nor_a_browser():
-    assert not names(EXTRAS["test"]) & {
-        "ray",
-        "pyarrow",
-        "playwright",
-        "opencv-python-headless",
-        "torchreg-articulated",
-    }
-
-
 def test_the_wheel_holds_all_it_needs_in_few_megabytes(tmp_path):
     source = tmp_path / "source"
     for folder in ("torchreg", "experiments", "configs"):

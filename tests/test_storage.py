@@ -17,16 +17,11 @@ from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.results import AlignRecord, AlignResult, Calibration
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.registration.bones.grid_lbs import GridLBS
-from torchreg.registration.bones.sparse_grid import SparseGrid
-from torchreg.registration.results import ScanRegistration
 from torchreg.result import Result, Status, formerly
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.pose_prior import PosePrior
 from torchreg.shapes.primitives import Primitive
-from torchreg.spines.results import SpineSequence
-from torchreg.spines.spine import Spine
 from torchreg.storage import load, load_pose, save_result
 from torchreg.tracking.results import DemoResult, TrackResult
 
@@ -86,13 +81,6 @@ def test_records_of_different_batches_come_back_in_order(tmp_path):
     saved = result((3,), history=(record(0, batch=3), record(1, batch=3), record(2, batch=1), record(3, batch=2)))
     saved.save(tmp_path / "r.safetensors")
     assert same(saved, load(tmp_path / "r.safetensors"))
-
-
-def test_a_history_is_few_tensors(tmp_path):
-    result(history=tuple(record(step) for step in range(50))).save(tmp_path / "r.safetensors")
-    description = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
-    assert description["tensors"]["history.pose"]["shape"] == [50, 1, 9]
-    assert len(description["tensors"]) == 8 + 4
 
 
 def test_what_align_returns_can_be_saved(tmp_path):
@@ -295,15 +283,6 @@ def test_poses_are_read_from_every_format(tmp_path, hand):
         assert torch.equal(load_pose(tmp_path / name, hand), pose), name
 
 
-def test_joints_that_are_not_named_stay_at_rest(tmp_path, hand):
-    (tmp_path / "p.json").write_text('{"base_z": 0.5, "index_pip_flexion": 1}', encoding="utf-8")
-    pose = load_pose(tmp_path / "p.json", hand)
-    assert pose[hand.dof_names.index("base_z")] == 0.5
-    assert pose[hand.dof_names.index("index_pip_flexion")] == 1
-    assert pose.count_nonzero() == 2
-    assert pose.dtype == hand.rest.dtype
-
-
 @pytest.mark.parametrize(
     ("name", "content", "error", "message"),
     [
@@ -334,18 +313,6 @@ def test_files_without_a_pose_are_refused(tmp_path, hand, name, content, error, 
         load_pose(tmp_path / name, hand)
 
 
-def test_archives_without_a_pose_are_refused(tmp_path, hand):
-    np.savez(tmp_path / "two.npz", a=np.zeros(27), b=np.zeros(27))
-    with pytest.raises(FormatError, match="holds the arrays a, b; call one of them pose"):
-        load_pose(tmp_path / "two.npz", hand)
-    np.savez(tmp_path / "objects.npz", pose=np.array([{}], dtype=object))
-    with pytest.raises(FormatError, match="cannot be read as NPZ"):
-        load_pose(tmp_path / "objects.npz", hand)
-    np.savez(tmp_path / "empty.npz")
-    with pytest.raises(FormatError, match="cannot be read as NPZ"):
-        load_pose(tmp_path / "empty.npz", hand)
-
-
 def test_the_last_known_pose_of_a_track_is_read(tmp_path, hand):
     poses = torch.arange(3.0).unsqueeze(-1).repeat(1, hand.num_dofs)
     poses[2], done = torch.nan, (Status.CONVERGED,) * 3
@@ -356,62 +323,6 @@ def test_the_last_known_pose_of_a_track_is_read(tmp_path, hand):
     )
     with pytest.raises(FormatError, match="in which the shape was never found"):
         load_pose(tmp_path / "n.safetensors", hand)
-
-
-def test_only_alignments_and_tracks_hold_a_pose(tmp_path, hand):
-    demonstration().save(tmp_path / "d.safetensors")
-    with pytest.raises(FormatError, match="holds a DemoResult; a pose is read from an AlignResult"):
-        load_pose(tmp_path / "d.safetensors", hand)
-    with pytest.raises(FileNotFoundError):
-        load_pose(tmp_path / "none.csv", hand)
-
-
-def test_spines_come_back_with_their_model(tmp_path):
-    generator = torch.Generator().manual_seed(0)
-    ends = torch.randn(3, 4, 1, 3, generator=generator, dtype=torch.float64)
-    share = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
-    graph = torch.tensor([[0, 3], [1, 3], [2, 3]])
-    curves = ends[:, :3] + share * (ends[:, 3:] - ends[:, :3])
-    model = Spine(curves, graph, times=torch.tensor([0.0, 1.0, 4.0]))
-    sequence = SpineSequence(
-        model=model, graph=graph, curves=curves, radii=torch.ones(3, 3, 5), frames=model.rest_frames, times=model.times,
-        found=torch.ones(3, 3, dtype=torch.bool), own=torch.zeros(3, 3, dtype=torch.bool), reference=1,
-        topologies=("(()()())",) * 3, own_topologies=("(()())", "(()()())", "(()()())"),
-        statuses=(Status.WITH_WARNINGS, Status.CONVERGED, Status.CONVERGED), status=Status.WITH_WARNINGS,
-        warnings=("frame 0: tips 2 not found",),
-    )  # fmt: skip
-    with torch.no_grad():
-        model.nodes[0, 0] += 1.0  # refined after the extraction
-    sequence.save(tmp_path / "spine.safetensors")
-    again = load(tmp_path / "spine.safetensors")
-    assert isinstance(again, SpineSequence)
-    assert torch.equal(again.model(2.5), model(2.5))
-    assert torch.equal(again.tips, sequence.tips)
-    assert torch.equal(again.junctions, curves[:, :1, -1])
-    assert again.num_tips == 3
-    assert (again.warnings, again.own_topologies, again.statuses) == (
-        sequence.warnings, sequence.own_topologies, sequence.statuses
-    )  # fmt: skip
-
-
-def test_models_on_grids_come_back_as_they_were(tmp_path):
-    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    grid = SparseGrid.from_points(points, 5)
-    weights = torch.rand(grid.num_corners, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    motions = torch.eye(4, dtype=torch.float64).repeat(3, 2, 1, 1)
-    motions[:, 1, 2, 3] = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
-    model = GridLBS(grid, weights, motions, blend="dual_quaternion")
-    empty, rows = torch.zeros(0), torch.zeros(0, 3)
-    saved = ScanRegistration(
-        model=model, points=rows, faces=None, deformed=rows, labels=empty, transforms=motions[0],
-        weights=torch.zeros(0, 2), distances=empty, matched=empty, status=Status.CONVERGED, seconds=torch.zeros(4),
-    )  # fmt: skip
-    saved.save(tmp_path / "m.safetensors")
-    again = load(tmp_path / "m.safetensors").model
-    assert isinstance(again, GridLBS)
-    assert again.blend == "dual_quaternion"
-    assert torch.equal(again.weights, model.weights)
-    assert torch.equal(again(points), model(points))
 
 
 def test_energies_by_name_come_back_and_old_files_have_none(tmp_path):

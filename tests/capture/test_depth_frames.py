@@ -95,13 +95,6 @@ def test_nothing_is_known_behind_the_camera_and_in_holes():
     assert space.intrusion(points[None]).tolist() == [[0.0, 0.0]]
 
 
-def test_beside_the_mask_nothing_measured_is_free_too():
-    depth, mask = wall_with_box()
-    space = tr.DepthFrame(torch.where(mask, depth, 0.0), CAMERA, mask).free_space
-    found = space.intrusion(at_pixels(CAMERA, [50.0], [20.0], [3.0])[None])
-    assert float(found) == pytest.approx(6.5 * 3 / math.sqrt(60 * 66))
-
-
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["pinhole", "lens"])
 def test_the_gradient_is_that_of_finite_differences(camera):
     depth, mask = wall_with_box()

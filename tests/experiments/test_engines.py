@@ -14,11 +14,10 @@ import pytest
 from experiments.driver import run_sweep
 from experiments.engines.base import EngineConfig, share_code, visible_gpus
 from experiments.engines.by_name import make_engine
-from experiments.errors import ConfigError, ExperimentError, StoreError
+from experiments.errors import ConfigError, ExperimentError
 from experiments.plan import planned_trials
 from experiments.schema import AlignmentTrial, AlignSolver, HandScene, ProbeTrial, ScheduleConfig, SweepConfig
 from experiments.store import Store
-from experiments.worker import Job
 
 ENGINES = {"local": (), "ray": (), "slurm": ("--slurm", "cluster=local")}
 SWEEP = """
@@ -143,13 +142,6 @@ def test_all_engines_find_the_same_bit_for_bit(tmp_path, ray_cluster, monkeypatc
     expected = found("none")
     assert [found(name) for name in ENGINES] == [expected] * len(ENGINES)
     assert found("none", "adaptive") != expected
-
-
-def test_an_engine_passes_on_that_results_cannot_be_written(tmp_path):
-    """The folder is gone when the worker gets there."""
-    engine = make_engine("local", EngineConfig())
-    with contextlib.closing(engine), pytest.raises(StoreError, match=r"gone/claims/x cannot be written: No such file"):
-        list(engine.run([Job(str(tmp_path / "gone"), "probe", "x", {}, "s")]))
 
 
 def test_two_drivers_share_a_sweep(tmp_path, start_driver):

@@ -189,14 +189,9 @@ class FreeSpace:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What pictures show at points, (B, N): distance from the mask (pixels), depth and side margins (metres).
+    """What pictures show at points, (B, N): distance from the mask (pixels) and its slope, margins (metres).
 
-    Args:
-        plane: (B, N, 2) the points on the plane at depth one.
-        slope: (B, N, 2) of the distance.
-        ahead: how far before the measured surface.
-        sideways: how far outside of the mask; infinite inside.
-        counts: whether the point is in free space.
+    ``ahead`` of the measured surface, ``sideways`` outside of the mask, infinite inside; ``counts`` in free space.
     """
 
     plane: Tensor
