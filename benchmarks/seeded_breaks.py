@@ -37,17 +37,7 @@ COMPARISONS = {ast.Lt: ">", ast.Gt: "<", ast.LtE: ">=", ast.GtE: "<=", ast.Eq: "
 OPERATORS = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
 # Tests of all public names, of which those of a room know nothing.
 OF_DOORS = ("test_contracts.py", "test_default_dtypes.py", "test_far_coordinates.py", "test_storage.py")
-COPIED = [
-    "torchreg",
-    "tests",
-    "experiments",
-    "benchmarks",
-    "configs",
-    "docs",
-    "examples",
-    "pyproject.toml",
-    "README.md",
-]
+FOLDERS = ("torchreg", "tests", "experiments", "benchmarks", "configs", "docs", "examples")
 UNWANTED = shutil.ignore_patterns("node_modules", "__pycache__", "_build")
 
 
@@ -154,7 +144,7 @@ def tests_of(found: Break, root: Path) -> list[str]:
 
 def copied(root: Path, folder: Path) -> Path:
     """Copy what tests need of a checkout, and return the folder."""
-    for name in COPIED:
+    for name in (*FOLDERS, "pyproject.toml", "README.md"):
         if (root / name).is_dir():
             shutil.copytree(root / name, folder / name, ignore=UNWANTED)
         elif (root / name).exists():

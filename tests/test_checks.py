@@ -9,9 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import torchreg as tr
 from torchreg import _checks as checks
-from torchreg.errors import InputError, InputTypeError
 
+InputError, InputTypeError = tr.errors.InputError, tr.errors.InputTypeError
 ONE = torch.zeros(1)
 SHAPES = [
     ((3,), ("N", 3), False, r"points must have shape \(N, 3\), got \(3,\)"),

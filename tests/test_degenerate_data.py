@@ -5,9 +5,7 @@ import torch
 
 import torchreg as tr
 from tests import bodies
-from torchreg.errors import DegenerateDataWarning, InputError, PrecisionWarning
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.geometry.spread import spread_dimensions
 from torchreg.registration.dense.config import ScanAlignConfig
 
 QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100), num_samples=150)
@@ -31,20 +29,9 @@ def finger():
     return bodies.finger()
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.7])
-def test_dimensions_are_counted_whatever_the_direction(turn):
-    cosine, sine = torch.tensor(turn).cos(), torch.tensor(turn).sin()
-    rotation = torch.tensor([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-    clouds = torch.stack([points for points, _ in CLOUDS.values()] + [DRAWN]) @ rotation + 5
-    assert spread_dimensions(clouds, 1.0).tolist() == [0, 0, 1, 2, 3]
-    valid = torch.ones(200, dtype=torch.bool)
-    valid[2:] = False
-    assert int(spread_dimensions(DRAWN, 1.0, valid)) == 1
-
-
 def test_alignment_tracker_and_calibration_say_what_is_wrong(finger, cloud):
     data, where = cloud
-    with pytest.warns(DegenerateDataWarning, match=f"lie {where}.* determine no pose"):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=f"lie {where}.* determine no pose"):
         found = tr.align(finger, data, finger.rest_pose(), config=tr.AlignConfig(search="never"))
     assert found.status is tr.Status.DEGENERATE
     assert not found.status.usable
@@ -52,15 +39,15 @@ def test_alignment_tracker_and_calibration_say_what_is_wrong(finger, cloud):
 
 def test_tracker_and_calibration_say_it_too(finger):
     data, where = CLOUDS["plane"]
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         assert set(tr.Tracker(finger).run([data, data]).statuses) == {tr.Status.DEGENERATE}
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         assert tr.calibrate(finger, [data, data], finger.rest_pose().repeat(2, 1)).status is tr.Status.DEGENERATE
 
 
 def test_nothing_is_confident(finger, cloud):
     data, where = cloud
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         assert float(tr.find_pose(finger, data, config=SEARCH).confidence) == 0
     layer = tr.PoseInitializer(finger, tr.PoseInitializerConfig(find_pose=SEARCH))
     assert float(layer(data, start=finger.rest_pose()).confidence) == 0
@@ -69,14 +56,14 @@ def test_nothing_is_confident(finger, cloud):
 def test_scans_that_may_slide_are_told(cloud):
     data, where = cloud
     if where == "at one place":
-        with pytest.raises(InputError, match="3 places or more"):
+        with pytest.raises(tr.errors.InputError, match="3 places or more"):
             tr.RangeScan(data)
         return
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         found = tr.register(tr.RangeScan(data), tr.RangeScan(data + 0.01), 2, 8, QUICK)
     assert not found.status.usable
     if where == "on a plane":
-        with pytest.warns(DegenerateDataWarning, match=where):
+        with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
             found = tr.register_sequence([tr.RangeScan(data), tr.RangeScan(data + 0.01)], 2, 8, QUICK)
         assert found.status is tr.Status.DEGENERATE
 
@@ -91,5 +78,5 @@ def test_a_flat_surface_has_a_note():
 def test_single_precision_far_away_is_warned_of(finger):
     near, start = tr.sample_skin(finger, 150)(finger.rest_pose()).detach(), finger.rest_pose()
     start[:3] = torch.tensor([1e4, -2e4, 1.5e4])
-    with pytest.warns(PrecisionWarning, match="float32 rounds to 0.0024.*compute in float64"):
+    with pytest.warns(tr.errors.PrecisionWarning, match="float32 rounds to 0.0024.*compute in float64"):
         tr.align(finger, near + start[:3], start, config=tr.AlignConfig(search="never"))

@@ -7,7 +7,6 @@ import torch
 
 import torchreg as tr
 from tests.bodies import bent_tube
-from torchreg.errors import UnitsWarning
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import sample_surface, unit_sphere
 from torchreg.io.points import load_points, save_points
@@ -74,7 +73,7 @@ def test_results_far_away_know_their_origin(arm, tmp_path):
 
 @pytest.mark.parametrize(("unit", "factor", "name"), [(1000, "0.001", "millimeters"), (100, "0.01", "centimeters")])
 def test_data_in_other_units_are_named_with_the_factor(arm, unit, factor, name):
-    with pytest.warns(UnitsWarning, match=f"If they are in {name}, load them with scale={factor}"):
+    with pytest.warns(tr.errors.UnitsWarning, match=f"If they are in {name}, load them with scale={factor}"):
         tr.align(arm, arm.surface_mesh().vertices * unit, arm.rest_pose(), config=tr.AlignConfig(search="never"))
 
 

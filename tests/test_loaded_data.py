@@ -4,7 +4,6 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.errors import InputTypeError
 from torchreg.geometry.loaded import as_mesh, as_points, as_scan
 from torchreg.io.points import save_points
 from torchreg.registration.dense.config import ScanAlignConfig
@@ -27,11 +26,11 @@ def test_points_scans_and_meshes_of_what_was_loaded(loaded):
     for value in (cloud, mesh, scan):
         assert torch.equal(as_scan(value, "source").points, points)
         assert torch.equal(as_mesh(value, "mesh").faces, mesh.faces)
-    with pytest.raises(InputTypeError, match=r"source must be a RangeScan, got Tensor; .* load a file"):
+    with pytest.raises(tr.errors.InputTypeError, match=r"source must be a RangeScan, got Tensor; .* load a file"):
         as_scan(points, "source")
-    with pytest.raises(InputTypeError, match="mesh must be a TriangleMesh, got Tensor; load a file with load_mesh"):
+    with pytest.raises(tr.errors.InputTypeError, match="mesh must be a TriangleMesh, got Tensor; load a file with"):
         as_mesh(points, "mesh")
-    with pytest.raises(InputTypeError, match="got the points of a RangeScan alone; mesh them first"):
+    with pytest.raises(tr.errors.InputTypeError, match="got the points of a RangeScan alone; mesh them first"):
         as_mesh(tr.RangeScan(points), "mesh")
 
 

@@ -32,22 +32,6 @@ def texts():
                 yield path, path.read_text(encoding="utf-8", errors="replace")
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("pip install 'torchreg" + "[viewer]'", True),
-        ("pip install torchreg" + "", True),
-        ("pip install 'torchreg-articulated[viewer]'", False),
-        ("pip install . && .venv/bin/torchreg demo", False),
-        ("pip install 'torchreg-articulated[viewer]' && torchreg demo", False),
-        ("pip install 'torchreg-articulated[viewer]'\ntorchreg demo", False),
-        ("pip install torchreg-articulated", False),
-    ],
-)
-def test_which_words_install_the_other_project(text, wrong):
-    assert bool(WRONG.search(text)) is wrong
-
-
 def test_nothing_tells_to_install_the_other_project():
     wrong = [f"{path}: {found[0]}" for path, text in texts() for found in WRONG.finditer(text)]
     assert [row for row in wrong if "test_packaging" not in row] == []

@@ -17,7 +17,6 @@ from experiments.driver import run_sweep
 from experiments.errors import ConfigError, ExperimentError, StoreError
 from experiments.plan import planned_trials
 from experiments.records import TrialRecord, provenance
-from experiments.report import charts
 from experiments.report.cells import cells_of, marginal
 from experiments.report.intervals import confidence_interval
 from experiments.report.page import write_report
@@ -159,27 +158,6 @@ def test_missing_and_foreign_records_are_named(fill, store, page, grid, probe_sw
     message = r"unknown metric eror_mm in report; known metrics: error_mm, failed, seconds\.run"
     with pytest.raises(ConfigError, match=message):
         page(replace(grid, report=replace(grid.report, metrics=("eror_mm",))))
-
-
-def test_curves_lie_at_their_steps_with_a_band_over_the_seeds(fill, probe_sweep):
-    report = ReportConfig(curves=("error_mm",), curve_steps="steps", curve_spread=True)
-    sweep = probe_sweep(grid={"scale": [1.0]}, seeds=3, report=report)
-    records = fill(sweep, lambda config: 1.0 + config["seed"])
-    found = {name: replace(one, curves=one.curves | {"steps": [0.0, 50.0]}) for name, one in records.items()}
-
-    def chart(**settings):
-        changed = replace(sweep, report=replace(report, **settings))
-        return charts.curves(changed, planned_trials(changed), found, "error_mm")
-
-    # Errors end at 1, 2 and 3, and begin at their doubles.
-    assert '"x":[0.0,50.0],"y":[4.0,2.0]' in chart()
-    assert '"x":[0.0,50.0,50.0,0.0],"y":[6.0,3.0,1.0,2.0]' in chart()
-    assert "mean, lowest and highest over all trials" in chart()
-    assert ('"type":"log"' in chart(), '"type":"log"' in chart(curve_log=True)) == (False, True)
-    assert charts.curve_names(replace(sweep, report=replace(report, curves=())), found) == ["error_mm"]
-    plain = chart(curve_steps="", curve_spread=False)
-    assert '"x":[1.0,2.0],"y":[4.0,2.0]' in plain
-    assert plain.count('"type":"scatter","x"') + plain.count('"y":[') <= 2
 
 
 def test_shares_have_the_interval_of_a_score_test():

@@ -3,7 +3,6 @@
 import ast
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,22 +109,6 @@ def test_scans_from_a_file(tmp_path, bench, toy):
     assert set(found.seconds) == {"setup", "initialize", "align", "weights", "total"}
     assert found.seconds["total"] == pytest.approx(sum(found.seconds[name] for name in registration.STAGES), rel=1e-5)
     assert {path.name for path in bench.folder.iterdir()} >= set(found.artifacts.values())
-
-
-def test_pairs_that_are_not_registered_are_tried_again_with_other_parameters(monkeypatch, toy):
-    tried = []
-
-    def register(source, target, *, num_bones, config, grid_resolution, generator):
-        tried.append((config.printed.max_distance, grid_resolution, generator.initial_seed()))
-        return SimpleNamespace(deformed=toy.truth if len(tried) == 3 else source.points + source.diagonal)
-
-    monkeypatch.setattr(registration.tr, "register", register, raising=False)
-    trial = RegistrationTrial(method="paper", retries=5)
-    assert registration._registered(toy, trial)[1] == 3
-    assert len(set(tried)) == 3
-    assert tried[0] == (20.0, 50, 0)
-    tried.clear()
-    assert registration._registered(toy, replace(trial, retries=0))[1] == 1
 
 
 def test_experiments_use_the_public_library_alone():

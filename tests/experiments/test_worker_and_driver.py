@@ -1,6 +1,5 @@
 """Trials in a worker and sweeps by a driver: each runs once, and whatever happens is recorded."""
 
-import errno
 import json
 import os
 import time
@@ -15,7 +14,6 @@ from experiments.claims import claimed
 from experiments.driver import run_sweep
 from experiments.engines.base import EngineConfig
 from experiments.engines.local import LocalEngine
-from experiments.errors import StoreError
 from experiments.plan import planned_trials
 from experiments.registry import TrialOutcome
 from experiments.schema import ProbeTrial
@@ -85,26 +83,6 @@ def test_warnings_and_odd_numbers_are_recorded_and_threads_are_set(store, make_j
 
 def run(sweep, store, engine, **settings):
     return run_sweep(sweep, store, lambda: engine, **settings)
-
-
-def test_a_disk_that_fills_up_stops_the_sweep_and_loses_nothing(store, probe_sweep, inline_engine, monkeypatch):
-    sweep, real, left = probe_sweep(seeds=2), os.fsync, [8]
-
-    def fsync(handle):
-        left[0] -= 1
-        if left[0] < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(handle)
-
-    message = "No space left on device; free some space and give the same command again"
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fsync)
-        with pytest.raises(StoreError, match=message):
-            run(sweep, store, inline_engine)
-    kept = len(list(store.trials.glob("*.json")))
-    assert 0 < kept < 6
-    summary = run(sweep, store, inline_engine)
-    assert (summary.kept, summary.ran, summary.unfinished) == (kept, 6 - kept, 0)
 
 
 def test_a_trial_that_hangs_is_ended_and_recorded_as_such(store, probe_sweep):
