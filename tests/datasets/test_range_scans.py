@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-import torchreg as tr
 from torchreg.datasets import depth_scanner, scan_sequences, solids
 
 MIDDLE = (0.1, 0.05, 3.0)
@@ -62,19 +61,6 @@ def test_missing_parts_are_missing_in_every_other_frame(toy):
         assert not bool((pair.visible & pair.missing).any())
     assert any(bool(pair.missing.any()) for pair in gone)
     assert not bool(toy.pair(1, 2).missing.any())
-
-
-def test_every_way_to_ask_gives_the_same(toy):
-    pairs, alone = list(toy.pairs(2)), toy.pair(3, 5)
-    assert len(pairs) == 6
-    for name in ("truth", "labels", "target_labels", "joints", "visible"):
-        assert torch.equal(getattr(pairs[3], name), getattr(alone, name))
-    for one, other in (
-        (alone.source.points, toy[3].points), (alone.target.points, toy[5].points), (alone.truth, toy.truth(3, 5)),
-        (alone.labels, toy.labels(3)), (alone.joints, toy.joints(3)), (toy[-1].points, toy[7].points),
-    ):  # fmt: skip
-        assert torch.equal(one, other)
-    assert all(isinstance(frame, tr.RangeScan) for frame in toy)
 
 
 def test_a_clean_scan_lies_exactly_where_it_says():

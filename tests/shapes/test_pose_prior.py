@@ -72,6 +72,12 @@ def test_log_prob_is_that_of_the_gaussian_of_the_same_covariance(hand, poses):
     torch.testing.assert_close(prior.log_prob(poses.reshape(3, 100, 27)).flatten(), prior.log_prob(poses))
 
 
+def test_limits_cost(hand, prior):
+    beyond, steeper = prior.mean.clone(), prior.mean.clone()
+    beyond[7], steeper[7] = hand.upper[7], hand.upper[7] + 0.05
+    assert prior.log_prob(steeper) < prior.log_prob(beyond) - 0.5
+
+
 def test_a_turned_world_changes_no_joint_and_turns_the_mean(hand, poses, prior):
     turn = torch.tensor([0.5, -1.0, 0.8], dtype=D)
     turned = torch.cat([

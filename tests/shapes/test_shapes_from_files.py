@@ -209,6 +209,12 @@ def test_one_kind_can_be_fitted_to_every_link(tmp_path):
     assert torch.equal(sizes.argmax(-1), torch.full((3,), 2))
 
 
+def test_names_of_further_solids_avoid_those_that_are_taken(tmp_path):
+    shape = robot(tmp_path, GRIPPER.replace('name="other"', 'name="open_1"'))
+    assert shape.num_parts == 4
+    assert {joint.name for joint in shape.kinematics.tree.joints} >= {"open", "open_1", "open_1_"}
+
+
 @torch.no_grad()
 def test_a_link_mesh_gets_a_fitted_solid(tmp_path):
     sphere = unit_sphere(2, dtype=D)
