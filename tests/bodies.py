@@ -1,4 +1,6 @@
-"""Small bodies that tests of several systems share."""
+"""Small bodies that tests of several systems share, and a registration of seconds."""
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -6,6 +8,9 @@ import torch
 import torchreg as tr
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.primitives import Primitive
+
+DEFAULT = tr.RegisterConfig()
+QUICK = replace(DEFAULT, align=replace(DEFAULT.align, num_samples=100, num_nodes=20), num_samples=100)
 
 
 def finger(dtype=None, unit=1.0):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchreg.alignment.results import AlignResult
-from torchreg.datasets.hand import surface_skin
+from torchreg.datasets import hand as made
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.result import Status
@@ -70,7 +70,7 @@ def plain_hand_skin(plain_hand):
 @pytest.fixture(scope="session")
 def plain_hand_surface(plain_hand):
     """The hand's whole surface as a skin with faces, from which clouds are drawn."""
-    return surface_skin(plain_hand, spacing=0.005)
+    return made.surface_skin(plain_hand, spacing=0.005)
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,7 @@ import torch
 import torchreg as tr
 from tests import bodies
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.registration.dense.config import ScanAlignConfig
 
-QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100), num_samples=150)
 SEARCH = tr.FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1, num_model_points=60)
 DRAWN = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
 CLOUDS = {
@@ -60,11 +58,11 @@ def test_scans_that_may_slide_are_told(cloud):
             tr.RangeScan(data)
         return
     with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
-        found = tr.register(tr.RangeScan(data), tr.RangeScan(data + 0.01), 2, 8, QUICK)
+        found = tr.register(tr.RangeScan(data), tr.RangeScan(data + 0.01), 2, 8, bodies.QUICK)
     assert not found.status.usable
     if where == "on a plane":
         with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
-            found = tr.register_sequence([tr.RangeScan(data), tr.RangeScan(data + 0.01)], 2, 8, QUICK)
+            found = tr.register_sequence([tr.RangeScan(data), tr.RangeScan(data + 0.01)], 2, 8, bodies.QUICK)
         assert found.status is tr.Status.DEGENERATE
 
 

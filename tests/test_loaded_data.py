@@ -4,11 +4,9 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.bodies import QUICK
 from torchreg.geometry.loaded import as_mesh, as_points, as_scan
 from torchreg.io.points import save_points
-from torchreg.registration.dense.config import ScanAlignConfig
-
-QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100, num_nodes=20), num_samples=100)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.rigid import se3_exp
 from torchreg.io.calibration import save_depth_camera
 from torchreg.io.images import save_depth, save_image
@@ -126,7 +125,7 @@ def test_several_pictures_of_any_size_are_those_alone():
         tr.DepthFrame(depth[:40, :40], small, mask[:40, :40]),
         tr.DepthFrame(depth, BENT),
     ]
-    together = FreeSpace.stacked([frame.free_space for frame in frames])
+    together = type(frames[0].free_space).stacked([frame.free_space for frame in frames])
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(3, 300, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 1.5])
     alone = [frame.free_space.intrusion(part[None])[0] for frame, part in zip(frames, points, strict=True)]

@@ -124,6 +124,16 @@ def test_a_layer_gives_the_mean_and_the_covariance(prior):
     assert torch.linalg.matrix_rank(few.weight.detach()) == 2
 
 
+def test_a_layer_before_a_head_gives_the_mean_and_small_steps_along_components(hand, prior):
+    head = tr.PoseHead(hand, joints="sigmoid")
+    linear = prior.init_head_(nn.Linear(64, head.num_features).double(), head)
+    with torch.no_grad():
+        mean, near = head(linear(torch.zeros(64, dtype=D))), head(linear(1e-4 * seeded(64)))
+    torch.testing.assert_close(hand.keypoints(mean), hand.keypoints(prior.mean), atol=1e-10, rtol=0)
+    step, joints = near[6:] - mean[6:], prior.components[6:, 6:]
+    assert (step - step @ joints.mT @ joints).norm() < 1e-3 * step.norm()
+
+
 def test_files(tmp_path, prior):
     path = tmp_path / "prior.safetensors"
     prior.save(path)

@@ -17,15 +17,12 @@ from experiments.made_up.plants import PlantForm, growing_plant
 from experiments.made_up.shape_sequences import other_hand, rig_sequence
 from experiments.made_up.toys import random_toy
 from experiments.made_up.walks import walking_animal, walking_figure
-from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.figures import meshed_figure
-from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy
-from torchreg.datasets.solids import RoundCone
+from torchreg.datasets import depth_scanner, figures, scan_sequences, solids
 
 HAND = tr.Hand().requires_grad_(False)
 REST, STILL = HAND.rest_pose(), torch.zeros(HAND.num_dofs)
 PHASE = torch.arange(0, 5, 0.02, dtype=torch.float64)
-SMALL, CLEAN = DepthScanner(num_points=800), DepthScanner(2500, noise=0.0, num_holes=0)
+SMALL, CLEAN = depth_scanner.DepthScanner(num_points=800), depth_scanner.DepthScanner(2500, noise=0.0, num_holes=0)
 MAN, BEAST = person(spacing=0.04), quadruped(spacing=0.04)
 KINDS = {**TRAINING_KINDS, **HELD_OUT_KINDS}
 
@@ -44,7 +41,7 @@ def euler(mesh):
 
 def creature(name):
     kind = KINDS[name][0](Draw(seeded(1)))
-    return meshed_figure(kind.parts, spacing=0.05, blend=0.01, softness=0.02)
+    return figures.meshed_figure(kind.parts, spacing=0.05, blend=0.01, softness=0.02)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +88,7 @@ def test_seeds_repeat_and_differ(make):
         (lambda: walking_figure(1), "frames"),
         (lambda: walking_animal(3, cycles_per_frame=0.0), "cycles_per_frame"),
         (lambda: random_toy(num_parts=10), "num_parts must be at most 9"),
-        (lambda: moving_labels(jointed_toy(2).pair(0, 1), -1.0), "tolerance"),
+        (lambda: moving_labels(scan_sequences.jointed_toy(2).pair(0, 1), -1.0), "tolerance"),
         (lambda: PlantForm(num_leaves=1), "num_leaves must be at least 2"),
         (lambda: PlantForm(sway=-1.0), "sway must be zero or positive"),
         (lambda: growing_plant(num_frames=1), "num_frames must be at least 2"),
@@ -128,7 +125,7 @@ def test_every_kind_of_creature_is_one_tree_of_parts_and_differs_at_every_draw(n
 
 
 def test_a_flat_cone_is_flat_and_its_distances_are_bounds():
-    flat = FlatCone(RoundCone((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2, 0.2), (0.0, 0.0, 1.0), 0.5)
+    flat = FlatCone(solids.RoundCone((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2, 0.2), (0.0, 0.0, 1.0), 0.5)
     surface = torch.tensor([[0.5, 0.2, 0.0], [0.5, 0.0, 0.1], [1.2, 0.0, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(flat.distance(surface), torch.zeros(3, dtype=torch.float64), atol=1e-12, rtol=0)
     around = torch.rand(200, 3, generator=seeded(0), dtype=torch.float64) * 2 - 0.5
@@ -170,7 +167,7 @@ def test_the_walk_has_the_pairs_and_the_motion_it_promises(walk):
 @pytest.mark.parametrize("frames", [(40, 41), (40, 42), (3, 4), (40, 41, 42, 43)])
 @pytest.mark.parametrize("tolerance", [0.005, 0.01])
 def test_parts_of_one_label_move_as_the_largest_does_and_others_do_not(walk, frames, tolerance):
-    some = ScanSequence(walk.figure, walk.transforms[list(frames)], walk.scanner, dtype=torch.float64)
+    some = scan_sequences.ScanSequence(walk.figure, walk.transforms[list(frames)], walk.scanner, dtype=torch.float64)
     scan, moving, true = some[0], moving_labels_over_time(some, 0, tolerance), some.labels(0)
     if len(frames) == 2:
         assert torch.equal(moving, moving_labels(some.pair(0, 1), tolerance))
