@@ -132,13 +132,15 @@ def drawn(count: int, seed: int, root: Path, rooms: Sequence[str] = (), like: Pa
 
 
 def tests_of(found: Break, root: Path) -> list[str]:
-    """Return the test files that look at a module, nearest first."""
+    """Return the test files that look at a module, nearest first: of its folder, of its room, that import it."""
     module, tests = ".".join(found.file.with_suffix("").parts), root / "tests"
     every = sorted(tests.rglob("test_*.py"))
+    folder = [path for path in every if path.parent == tests.joinpath(*found.file.parent.parts[1:])]
     room = [path for path in every if found.room in path.relative_to(root).parts]
     direct = [path for path in every if module in path.read_text()]
     doors = [tests / name for name in OF_DOORS if (tests / name) in every]
-    nearest = [path for path in room if path in direct], direct, room, doors
+    inner = [path for path in direct if path in room]
+    nearest = [path for path in inner if path in folder], inner, folder, room, direct, doors
     return list(dict.fromkeys(str(path.relative_to(root)) for paths in nearest for path in paths))
 
 

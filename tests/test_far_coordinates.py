@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.bodies import bent_tube
+from tests.bodies import QUICK, bent_tube, finger
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.points import load_points, save_points
@@ -51,20 +51,29 @@ def test_scans_and_frames_keep_their_digits(tmp_path):
     assert far.spacing == pytest.approx(near.spacing, rel=1e-6)
 
 
-def test_results_far_away_know_their_origin(arm, tmp_path):
-    mesh, start = arm.surface_mesh(spacing=0.02), arm.rest_pose()
-    far_start = torch.cat([start[:3] + MAP, start[3:]])
-    points = mesh.vertices[::3]
-    origin, steps = far_origin(points + MAP), []
-    aligned = tr.align(arm, points + MAP, far_start, on_step=steps.append)
-    assert tr.align(arm, points, start).origin is None
-    torch.testing.assert_close(aligned.local(start).pose[:3] + origin, aligned.pose[:3], atol=1e-4, rtol=0)
+def test_shapes_in_single_precision_keep_the_digits_of_data_far_away():
+    shape = finger()
+    start, points = shape.rest_pose(), tr.sample_skin(shape, 150)(shape.rest_pose()).detach().double()
+    far_start, steps = torch.cat([start[:3] + MAP, start[3:]]), []
+    near = tr.align(shape, points, start)
+    far = tr.align(shape, points + MAP, far_start, on_step=steps.append)
+    tracked = tr.Tracker(shape, far_start).run([points + MAP])
+    assert near.origin is None
+    assert torch.equal(far.origin, far_origin(points + MAP))
+    assert torch.equal(tracked.origin, far.origin)
+    for poses in (far.pose, tracked.poses[0], tr.find_pose(shape, points + MAP, num_starts=1).best):
+        assert poses.dtype == torch.float64
+        torch.testing.assert_close(poses[:3] - MAP, near.pose[:3].double(), atol=2e-3, rtol=0)
+    torch.testing.assert_close(far.registered - MAP, near.registered.double(), atol=4e-3, rtol=0)
+    torch.testing.assert_close(far.local(start).pose[:3] + far.origin, far.pose[:3], atol=1e-4, rtol=0)
     assert float((steps[-1].pose[..., :3] - MAP).abs().max()) < 1
-    tracked = tr.Tracker(arm, far_start).run([points + MAP])
-    scans = [tr.RangeScan(vertices + MAP, faces) for vertices, faces in (bent_tube(0.0, 13, 5), bent_tube(0.4, 13, 5))]
-    pair, spine = tr.register(*scans, 2, 8), tr.extract_spine([tr.TriangleMesh(mesh.vertices + MAP, mesh.faces)])
-    assert torch.equal(aligned.origin, origin)
-    assert torch.equal(tracked.origin, origin)
+
+
+def test_results_far_away_know_their_origin(arm, tmp_path):
+    mesh = arm.surface_mesh(spacing=0.02)
+    scans = [tr.RangeScan(points + MAP, faces) for points, faces in (bent_tube(bend, 13, 5) for bend in (0.0, 0.4))]
+    pair = tr.register(*scans, 2, 8, QUICK)
+    spine = tr.extract_spine([tr.TriangleMesh(mesh.vertices + MAP, mesh.faces)])
     pair.save(tmp_path / "r.safetensors")
     for result, field in ((pair, "deformed"), (tr.load(tmp_path / "r.safetensors"), "deformed"), (spine, "curves")):
         moved = getattr(result.local(), field) + result.origin

@@ -280,6 +280,15 @@ def test_poses_are_read_from_every_format(tmp_path, hand):
         assert torch.equal(load_pose(tmp_path / name, hand), pose), name
 
 
+def test_joints_that_are_not_named_stay_at_rest(tmp_path, hand):
+    (tmp_path / "p.json").write_text('{"base_z": 0.5, "index_pip_flexion": 1}', encoding="utf-8")
+    pose = load_pose(tmp_path / "p.json", hand)
+    assert pose[hand.dof_names.index("base_z")] == 0.5
+    assert pose[hand.dof_names.index("index_pip_flexion")] == 1
+    assert pose.count_nonzero() == 2
+    assert pose.dtype == hand.rest.dtype
+
+
 @pytest.mark.parametrize(
     ("name", "content", "error", "message"),
     [

@@ -49,6 +49,13 @@ def test_threads_that_overlap_get_their_numbers_back():
     assert torch.get_num_threads() == 2
 
 
+def test_large_work_keeps_all_threads():
+    with one_thread(False):
+        assert torch.get_num_threads() == 2
+    with one_thread(), one_thread(False):
+        assert torch.get_num_threads() == 1
+
+
 def who():
     return (
         threading.current_thread(),

@@ -108,6 +108,22 @@ def test_jacobian_matches_differences(two_balls, ball_skin):
     compare(surface.distance_jacobian(points, pose), (surface.distance(points, pose), slope), atol=2e-8)
 
 
+def test_of_copies_of_a_point_the_first_one_counts(two_balls, ball_skin):
+    """A copy that rides on another part is a point of its own."""
+    order = torch.cat([torch.arange(3000), torch.randperm(3000, generator=torch.Generator().manual_seed(5))])
+    points, normals, weights = ball_skin.points[order], ball_skin.normals[order].clone(), ball_skin.weights[order]
+    normals[3000:] *= -1
+    copied = tr.LinearBlendSkin(two_balls, points, weights, two_balls.rest_pose(), normals=normals)
+    pose = random_pose(two_balls, 6)
+    data = around_balls(two_balls, pose, 60)
+    expected = SkinSurface(ball_skin)
+    compare(SkinSurface(copied).distance_jacobian(data, pose), expected.distance_jacobian(data, pose))
+    weights = weights.clone()
+    weights[3000:] = weights[3000:].flip(-1)
+    other = tr.LinearBlendSkin(two_balls, points, weights, two_balls.rest_pose(), normals=normals)
+    assert torch.equal(SkinSurface(other).first, torch.arange(6000))
+
+
 def sphere_rig(rings):
     """Return a ball of triangles around one joint, as arrays and as a shape."""
     theta = torch.linspace(0.0, math.pi, rings + 1, dtype=D)[1:-1]
