@@ -34,7 +34,7 @@ class DepthScanner:
 
     Args:
         num_points: approximate number of points of the first frame, which determines the size of the pixels.
-        noise: standard deviation of a depth z as a multiple of z^2, 1/m: 2e-4 is 1.8 mm at 3 m, a good stereo camera.
+        noise: standard deviation of a depth z over z^2, 1/m: 2e-4 is 1.8 mm at 3 m, a good stereo camera.
         max_slant: no depth is measured where the ray meets the surface at more than this from its normal, radians.
         num_holes: round patches without data at random positions on the surface.
         hole_radius: of those, as a share of the diagonal of the mesh.
