@@ -135,6 +135,13 @@ def test_gradients_of_a_skin_in_the_pose_and_in_the_parameters_of_the_shape(hand
     assert torch.autograd.gradcheck(posed, tuple(value.requires_grad_() for value in values))
 
 
+def test_the_sharpness_of_a_skin_is_that_of_its_shape_unless_another_is_given(hand, pose):
+    points, sharp = around(hand, hand.rest_pose(), 20), tr.Hand(sharpness=7.0, dtype=D)
+    assert tr.BendingSkin(sharp, points).sharpness == sharp.sharpness == 7.0
+    assert torch.equal(tr.BendingSkin(sharp, points)(pose), tr.BendingSkin(hand, points, sharpness=7.0)(pose))
+    assert torch.equal(tr.BendingSkin(sharp, points, sharpness=2.0)(pose), tr.BendingSkin(hand, points)(pose))
+
+
 @torch.no_grad()
 def test_sampled_points_cover_the_surface_evenly(plain_hand):
     skin = tr.sample_skin(plain_hand, 300)

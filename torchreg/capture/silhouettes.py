@@ -43,8 +43,7 @@ class VisualHull:
     """The largest body with given silhouettes, as a signed distance field on a grid.
 
     Args:
-        field: (X, Y, Z) largest signed distance to the masks' outlines, times the size of a pixel at that depth:
-            negative inside, in the unit of the cameras. Far from the surface only its sign is meaningful.
+        field: (X, Y, Z) largest distance to the outlines, negative inside; far from the surface only its sign counts.
         origin: (3,) of sample (0, 0, 0).
         spacing: between samples.
     """
