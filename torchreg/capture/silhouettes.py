@@ -40,17 +40,11 @@ _CARVING = _Carving()
 
 @dataclass(frozen=True, eq=False)
 class VisualHull:
-    """The largest body with given silhouettes, as a signed distance field on a grid.
+    """The largest body with given silhouettes, as a signed distance field on a grid."""
 
-    Args:
-        field: (X, Y, Z) largest distance to the outlines, negative inside; far from the surface only its sign counts.
-        origin: (3,) of sample (0, 0, 0).
-        spacing: between samples.
-    """
-
-    field: Tensor
-    origin: Tensor
-    spacing: float
+    field: Tensor  # (X, Y, Z) largest distance to the outlines, negative inside; far off only its sign counts
+    origin: Tensor  # (3,) of sample (0, 0, 0), in the unit of the cameras
+    spacing: float  # between samples
 
     def mesh(self) -> TriangleMesh:
         """Return the watertight surface, oriented outwards."""
