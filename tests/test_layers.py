@@ -240,10 +240,7 @@ def test_packages_hold_nothing_but_their_docstring():
         ("errors.py", "from torchreg import result"),
         ("shapes/hand.py", "from torchreg import ArticulatedShape"),
         ("alignment/align.py", "from torchreg import __version__"),
-        (
-            "shapes/skin.py",
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torchreg.viz",
-        ),
+        ("shapes/skin.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torchreg.viz"),
         ("spines/tips.py", "from torchreg.registration.register import register"),
         ("alignment/align.py", "from torchreg.spines.skeletonize import skeletonize"),
         ("registration/bones/labels.py", "from torchreg.registration.dense.align_scans import align_scans"),

@@ -87,11 +87,7 @@ HIDDEN = torch.where(torch.arange(8).view(2, 4, 1) == 5, torch.nan, POINTS)
         ((POINTS[:, :0], POINTS[:, :0]), InputError, "predicted must hold at least 1 point, got 0"),
         ((POINTS, HIDDEN), InputError, "target must be finite, got 3 non-finite of 24 numbers; leave those points out"),
         ((POINTS, POINTS, torch.ones(4) > 0), InputError, r"mask must have shape \(2, 4\), got \(4,\)"),
-        (
-            (POINTS, POINTS, torch.ones(2, 4).long()),
-            InputTypeError,
-            r"mask must be a bool tensor, got dtype",
-        ),
+        ((POINTS, POINTS, torch.ones(2, 4).long()), InputTypeError, r"mask must be a bool tensor, got dtype"),
         ((POINTS, POINTS, [True]), InputTypeError, "mask must be a bool tensor, got list"),
         ((POINTS, POINTS.float()), InputTypeError, r"predicted is torch\.float64 .* but target is torch\.float32"),
         (("points", POINTS), InputTypeError, "predicted must be a tensor or an array"),

@@ -343,10 +343,7 @@ def test_energies_by_name_come_back_and_old_files_have_none(tmp_path):
         ({"dict": {"joint": {"tensor": "nothing"}}}, "names the tensor 'nothing', which is not there"),
     ):
         saved.save(tmp_path / "m.safetensors")
-        edit(
-            tmp_path / "m.json",
-            lambda m, w=wrong: m["fields"]["history"]["columns"]["energies"].__setitem__(0, w),
-        )
+        edit(tmp_path / "m.json", lambda m, w=wrong: m["fields"]["history"]["columns"]["energies"].__setitem__(0, w))
         with pytest.raises(FormatError, match=message):
             tr.load(tmp_path / "m.safetensors")
 

@@ -157,11 +157,7 @@ def test_files_make_a_frame(tmp_path):
         ({"depth": torch.ones(48, 63)}, InputError, r"depth must have shape \(48, 64\), got \(48, 63\)"),
         ({"depth": torch.zeros(48, 64)}, InputError, "got 0 of 384 pixels of the mask measured"),
         ({"depth": torch.full((48, 64), torch.nan)}, InputError, "got 0 of 384 pixels of the mask measured"),
-        (
-            {"depth": torch.full((48, 64), 570.0)},
-            InputError,
-            "must be in metres, got 570 in the middle; multiply",
-        ),
+        ({"depth": torch.full((48, 64), 570.0)}, InputError, "must be in metres, got 570 in the middle; multiply"),
         ({"camera": "k.json"}, InputTypeError, "camera must be a Camera, got str"),
         ({"mask": torch.ones(48, 64)}, InputTypeError, "mask must hold bool"),
         ({"mask": torch.ones(48, 60, dtype=torch.bool)}, InputError, r"mask must have shape \(48, 64\)"),

@@ -238,10 +238,7 @@ def test_errors_name_the_file_or_the_frame(rig, folders, tmp_path):
     save_image(tmp_path / "camera00" / "1.png", torch.zeros(64, 80))
     frames = tr.SilhouetteFrames([tmp_path / "camera00", places[1]], rig)
     told = pytest.warns(tr.errors.FileWarning, match=r"0\.png: the mask keeps none")
-    with (
-        told,
-        pytest.raises(FormatError, match=r"camera00.0.png: is 20 x 10 pixels, .* camera00 are 80 x 64"),
-    ):
+    with told, pytest.raises(FormatError, match=r"camera00.0.png: is 20 x 10 pixels, .* camera00 are 80 x 64"):
         frames.mesh(0)
     told = pytest.warns(tr.errors.FileWarning, match=r"1\.png: the mask keeps none")
     with told, pytest.raises(FormatError, match=r"frame 1 .*1.png\): masks must show the whole object"):

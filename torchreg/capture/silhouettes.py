@@ -58,11 +58,7 @@ class VisualHull:
 
 
 def visual_hull(
-    masks: Sequence[Tensor],
-    cameras: CameraRig | Sequence[Camera],
-    *,
-    resolution: int = 256,
-    box: Tensor | None = None,
+    masks: Sequence[Tensor], cameras: CameraRig | Sequence[Camera], *, resolution: int = 256, box: Tensor | None = None
 ) -> VisualHull:
     """Return the visual hull of calibrated silhouettes: all points that every camera sees inside its mask.
 

@@ -119,12 +119,7 @@ def fused_points(
 
 
 def onto_fused(
-    solids: PrimitiveSet,
-    sizes: Sequence[Tensor],
-    frames: Tensor,
-    points: Tensor,
-    fuses: Tensor,
-    nu: float | Tensor,
+    solids: PrimitiveSet, sizes: Sequence[Tensor], frames: Tensor, points: Tensor, fuses: Tensor, nu: float | Tensor
 ) -> Tensor:
     """Return points (..., N, 3) after one Newton step onto their fused surface, ``x - d grad d / |grad d|^2``."""
     inverse = frames[..., :3].mT

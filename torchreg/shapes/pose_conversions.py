@@ -77,7 +77,7 @@ OPENXR_PARTS: dict[str, str] = {"PALM": "palm", **{_openxr_name(name): part for 
 _XR_KEYPOINTS = {
     "webxr": [
         WEBXR_JOINTS.index(name) for key in _KEYPOINTS for name, (_, keypoint) in _WEBXR.items() if keypoint == key
-    ],
+    ]
 }
 _XR_KEYPOINTS["openxr"] = [index + 1 for index in _XR_KEYPOINTS["webxr"]]
 _XR_SIZES = {"webxr": len(WEBXR_JOINTS), "openxr": len(OPENXR_JOINTS)}

@@ -50,11 +50,7 @@ _FIT = _RobotFit()
 
 
 def spec_from_urdf(
-    path: str | Path,
-    *,
-    package_dirs: Sequence[str | Path] = (),
-    primitive: str = "auto",
-    meshes: str = "warn",
+    path: str | Path, *, package_dirs: Sequence[str | Path] = (), primitive: str = "auto", meshes: str = "warn"
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a URDF robot; see `ArticulatedShape.from_urdf`."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
