@@ -66,6 +66,16 @@ def test_a_missing_opencv_is_told_with_its_extra(monkeypatch):
         match_disparity(left, right, 20, method="opencv")
 
 
+def test_opencv_matches_up_to_the_left_border():
+    pytest.importorskip("cv2")
+    left, right, truth = scene()
+    found = match_disparity(left, right, 30, method="opencv")
+    column = torch.arange(100).expand(50, 100)
+    both = (column - truth >= 2) & (column < 30)
+    assert found[both].isfinite().double().mean() > 0.7
+    assert not found[column < found].isfinite().any()
+
+
 def picture(column, row):
     """A smooth texture anywhere in the plane: waves of six to twenty pixels."""
     waves = torch.tensor([[0.9, 0.2], [0.5, -0.7], [-0.3, 0.6], [0.7, 0.5]], dtype=torch.float64)

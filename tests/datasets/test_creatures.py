@@ -40,3 +40,12 @@ def test_frames_are_meshed_anew_and_arms_that_touch_are_merged_in_the_frames_mar
     else:
         middle = sequence.tips[sequence.touching]
         assert float((middle[:, 0] - middle[:, 1]).norm(dim=-1).min()) > 2.5 * creatures.STARFISH.end
+
+
+def test_noise_roughens_the_surface_without_moving_it():
+    smooth, rough = (
+        creatures.creature_sequence(creatures.STARFISH, 1, resolution=48, noise=noise) for noise in (0.0, 0.5)
+    )
+    assert torch.equal(smooth.tips, rough.tips)
+    distance = torch.cdist(rough.meshes[0].vertices, smooth.meshes[0].vertices).amin(-1)
+    assert 0.005 < float(distance.mean()) < 0.05
