@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.datasets import depth_scanner, scan_sequences, solids
 
 MIDDLE = (0.1, 0.05, 3.0)
