@@ -98,6 +98,16 @@ def test_meshes_turned_inside_out_are_turned_back_and_open_ones_have_no_inside(a
     assert float(surface.distance(inside, POSE)) == pytest.approx(-0.04, abs=1e-3)
 
 
+def test_meshes_are_made_once_for_a_shape_and_its_surface(arm):
+    assert link_surface.link_meshes(arm) is link_surface.link_meshes(arm)
+    other = two_boxes()
+    before = link_surface.link_meshes(other)
+    other.surface = two_boxes(drop=2).surface
+    assert link_surface.link_meshes(other) is not before
+    area = 4 * float(SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[2] * SIZE[0])
+    assert link_surface.link_meshes(arm).spacing == pytest.approx(math.sqrt(area / 60_000))
+
+
 def test_shapes_that_blend_or_have_no_mesh_have_no_rigid_links(arm):
     assert link_surface.has_rigid_links(arm)
     assert not link_surface.has_rigid_links(tr.Hand())
