@@ -1,5 +1,7 @@
 """Distances to the exact meshes of rigid links."""
 
+import math
+
 import pytest
 import torch
 
