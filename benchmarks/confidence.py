@@ -37,10 +37,10 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchreg as tr
+from experiments.made_up.depth_noise import DepthNoise
 from experiments.made_up.shape_sequences import other_hand
 from torchreg.alignment.evidence.confidence import limb_ends
 from torchreg.alignment.evidence.reliability import CALIBRATION, Calibration, Evidence, confidence_of
-from torchreg.capture.depth_noise import DepthNoise
 from torchreg.datasets.hand import make_hand_cloud, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import compose_rotation_vectors

@@ -34,7 +34,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.capture.depth_noise import DepthNoise
+from experiments.made_up.depth_noise import DepthNoise
 from torchreg.datasets.hand import hand_motion, make_hand_cloud
 
 TIPS = [4, 8, 12, 16, 20]

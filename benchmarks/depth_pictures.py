@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,8 +24,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
-from torchreg.capture.depth_noise import DepthNoise
+from experiments.made_up.depth_noise import DepthNoise
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy
 from torchreg.geometry.rigid import se3_exp

@@ -33,8 +33,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from confidence import area_under_curve
 
 import torchreg as tr
+from experiments.made_up.depth_noise import DepthNoise
 from torchreg.alignment.evidence.reliability import CALIBRATION
-from torchreg.capture.depth_noise import DepthNoise
 from torchreg.datasets.hand import random_hand_pose, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp, so3_log

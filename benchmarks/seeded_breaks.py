@@ -1,15 +1,17 @@
 """How much of what could break the tests notice: seeded breaks of the code, one at a time.
 
-    python benchmarks/seeded_breaks.py --count 200            # an hour or two on two idle cores
-    python benchmarks/seeded_breaks.py --count 40 --jobs 2 --limit 60
+    python benchmarks/seeded_breaks.py --count 200            # two hours of one core; --jobs 2 for two
+    python benchmarks/seeded_breaks.py --count 40 --limit 60 --room spines
+    python benchmarks/seeded_breaks.py --root ../before --like .    # another checkout, at the places that both have
     python benchmarks/seeded_breaks.py --smoke                # one break, to see that it runs
 
 A break swaps a comparison, a sum and a difference, a product and a quotient, "and" and "or", or doubles a number, in
 a function of torchreg, in a copy of the checkout. Places are drawn evenly over the lines of all rooms, by a hash of
 the function's name and of what stands there: a function that only moves to another file keeps its breaks.
-The tests of a break are those that import its module, then those of its room and of all public names; it is noticed if
-one of them fails within the limit of time.
-Breaks that change nothing (a bound that no input reaches) stay unnoticed in any suite: compare shares of two suites.
+The tests of a break are those that import its module, then those of its room and of all public names, up to the first
+that fails. A break that the suite has not noticed within the limit of processor time is counted by itself: it tells
+of the limit, not of the suite. Breaks that change nothing (a bound that no input reaches) stay unnoticed in any suite:
+compare shares of two suites.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import argparse
 import ast
 import hashlib
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -27,23 +30,15 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 
 ROOT = Path(__file__).resolve().parents[1]
 COMPARISONS = {ast.Lt: ">", ast.Gt: "<", ast.LtE: ">=", ast.GtE: "<=", ast.Eq: "!=", ast.NotEq: "=="}
 OPERATORS = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
-# Tests of files that a copy lacks.
-OF_FILES = ("test_packaging.py", "test_readme.py", "test_licenses.py", "test_layers.py")
-COPIED = (
-    "torchreg",
-    "tests",
-    "experiments",
-    "benchmarks",
-    "configs",
-    "docs",
-    "examples",
-    "pyproject.toml",
-    "README.md",
-)
+# Tests of all public names, of which those of a room know nothing.
+OF_DOORS = ("test_contracts.py", "test_default_dtypes.py", "test_far_coordinates.py", "test_storage.py")
+FOLDERS = ("torchreg", "tests", "experiments", "benchmarks", "configs", "docs", "examples")
+UNWANTED = shutil.ignore_patterns("node_modules", "__pycache__", "_build")
 
 
 @dataclass(frozen=True)
@@ -58,9 +53,14 @@ class Break:
     end: tuple[int, int]
     text: str
 
+    @property
+    def place(self) -> str:
+        """What stands there: moving the function to another file does not change it."""
+        return f"{self.function} {self.original} {self.number}"
+
     def rank(self, seed: int) -> str:
-        """Return a number drawn for the place, which moving its function to another file does not change."""
-        return hashlib.sha256(f"{seed} {self.function} {self.original} {self.number}".encode()).hexdigest()
+        """Return a number drawn for the place."""
+        return hashlib.sha256(f"{seed} {self.place}".encode()).hexdigest()
 
     @property
     def room(self) -> str:
@@ -117,59 +117,63 @@ def compiles(found: Break, root: Path) -> bool:
         return False
 
 
-def drawn(count: int, seed: int, root: Path, rooms: Sequence[str] = ()) -> list[Break]:
-    """Return breaks at seeded places, spread over the lines of all rooms."""
-    every = [
-        found for path in sorted((root / "torchreg").rglob("*.py")) for found in breaks_of(path.relative_to(root), root)
-    ]
-    every = sorted((found for found in every if not rooms or found.room in rooms), key=lambda found: found.rank(seed))
-    chosen = (found for found in every if compiles(found, root))
+def every_break(root: Path) -> list[Break]:
+    files = sorted((root / "torchreg").rglob("*.py"))
+    return [found for path in files for found in breaks_of(path.relative_to(root), root)]
+
+
+def drawn(count: int, seed: int, root: Path, rooms: Sequence[str] = (), like: Path | None = None) -> list[Break]:
+    """Return breaks at seeded places, spread over the lines of all rooms; those that another checkout has, too."""
+    shared = None if like is None else {found.place for found in every_break(like)}
+    every = [found for found in every_break(root) if not rooms or found.room in rooms]
+    every = [found for found in every if shared is None or found.place in shared]
+    chosen = (found for found in sorted(every, key=lambda found: found.rank(seed)) if compiles(found, root))
     return [found for _, found in zip(range(count), chosen, strict=False)]
 
 
 def tests_of(found: Break, root: Path) -> list[str]:
-    """Return the test files that look at a module, nearest first."""
-    module = ".".join(found.file.with_suffix("").parts)
-    every = sorted((root / "tests").rglob("test_*.py"))
+    """Return the test files that look at a module, nearest first: of its folder, of its room, that import it."""
+    module, tests = ".".join(found.file.with_suffix("").parts), root / "tests"
+    every = sorted(tests.rglob("test_*.py"))
+    folder = [path for path in every if path.parent == tests.joinpath(*found.file.parent.parts[1:])]
+    room = [path for path in every if found.room in path.relative_to(root).parts]
     direct = [path for path in every if module in path.read_text()]
-    room = [path for path in every if found.room in path.relative_to(root).parts and path not in direct]
-    doors = [
-        path for path in every if path.parent == root / "tests" and path not in direct and path.name not in OF_FILES
-    ]
-    return [str(path.relative_to(root)) for path in [*direct, *room, *doors]]
+    doors = [tests / name for name in OF_DOORS if (tests / name) in every]
+    inner = [path for path in direct if path in room]
+    nearest = [path for path in inner if path in folder], inner, folder, room, direct, doors
+    return list(dict.fromkeys(str(path.relative_to(root)) for paths in nearest for path in paths))
 
 
-def is_noticed(found: Break, root: Path, limit: float) -> bool:
-    """Return whether a test fails where a break is made, in a copy of a checkout."""
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder)
-        for name in COPIED:
-            source = root / name
-            if source.is_dir():
-                shutil.copytree(
-                    source, copy / name, ignore=shutil.ignore_patterns("node_modules", "__pycache__", "_build")
-                )
-            elif source.exists():
-                shutil.copy2(source, copy / name)
-        broken = copy / found.file
-        broken.write_text(found.applied(broken.read_text()))
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-x",
-            "-q",
-            "-p",
-            "no:cacheprovider",
-            "--no-header",
-            *tests_of(found, copy),
-        ]
-        environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
-        try:
-            done = subprocess.run(command, cwd=copy, capture_output=True, timeout=limit, env=environment)
-        except subprocess.TimeoutExpired:
-            return False
-    return done.returncode == 1 or done.returncode == 2
+def copied(root: Path, folder: Path) -> Path:
+    """Copy what tests need of a checkout, and return the folder."""
+    for name in (*FOLDERS, "pyproject.toml", "README.md"):
+        if (root / name).is_dir():
+            shutil.copytree(root / name, folder / name, ignore=UNWANTED)
+        elif (root / name).exists():
+            shutil.copy2(root / name, folder / name)
+    return folder
+
+
+def outcome(found: Break, copy: Path, limit: float) -> str:
+    """Return "noticed" where a test of a copy with the break fails, else "MISSED", or "no time" beyond the limit."""
+    broken = copy / found.file
+    whole = broken.read_text()
+    options = ["-x", "-q", "-p", "no:cacheprovider", "--no-header"]
+    command = [sys.executable, "-m", "pytest", *options, *tests_of(found, copy)]
+    environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    try:
+        broken.write_text(found.applied(whole))
+        with subprocess.Popen(command, cwd=copy, env=environment, **quiet) as tests:
+            resource.prlimit(tests.pid, resource.RLIMIT_CPU, (round(limit), round(limit) + 1))
+            try:
+                code = tests.wait(20 * limit)  # something may wait for ever
+            except subprocess.TimeoutExpired:
+                tests.kill()
+                code = -1
+    finally:
+        broken.write_text(whole)
+    return "noticed" if code in (1, 2) else "MISSED" if code == 0 else "no time"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -177,24 +181,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=200, help="breaks")
     parser.add_argument("--seed", type=int, default=0, help="of the places")
     parser.add_argument("--jobs", type=int, default=1, help="breaks at a time")
-    parser.add_argument("--limit", type=float, default=120.0, help="seconds of tests for each break")
+    parser.add_argument("--limit", type=float, default=120.0, help="processor seconds of tests for each break")
     parser.add_argument("--room", action="append", default=[], help="break this room only; may be given several times")
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout")
+    parser.add_argument("--like", type=Path, help="another checkout: only places that it has as well")
     parser.add_argument("--smoke", action="store_true", help="one break of a small module")
     given = parser.parse_args(arguments)
+    if given.smoke:
+        given.count, given.room = 1, ["metrics.py"]
     root = given.root.resolve()
-    chosen = drawn(1 if given.smoke else given.count, given.seed, root, ["metrics.py"] if given.smoke else given.room)
-    with ThreadPoolExecutor(given.jobs) as pool:
-        noticed = list(pool.map(lambda found: is_noticed(found, root, given.limit), chosen))
-    made, seen = Counter(found.room for found in chosen), Counter()
-    for found, is_seen in zip(chosen, noticed, strict=True):
-        seen[found.room] += is_seen
-        print(
-            f"{'noticed' if is_seen else 'MISSED '} {found.file}:{found.start[0]} {found.function} {found.text.strip()}"
-        )
-    for room, count in sorted(made.items()):
-        print(f"{room:14} {seen[room]:4} of {count:4}")
-    print(f"noticed {sum(noticed)} of {len(noticed)}, {sum(noticed) / max(len(noticed), 1):.0%}")
+    chosen = drawn(given.count, given.seed, root, given.room, given.like)
+    counts, copies = Counter[tuple[str, str]](), SimpleQueue[Path]()
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
+        for number in range(given.jobs):
+            (Path(folder) / str(number)).mkdir()
+            copies.put(copied(root, Path(folder) / str(number)))
+
+        def tried(found: Break) -> str:
+            copy = copies.get()
+            try:
+                return outcome(found, copy, given.limit)
+            finally:
+                copies.put(copy)
+
+        for found, result in zip(chosen, pool.map(tried, chosen), strict=True):
+            counts[found.room, result] += 1
+            place = f"{found.file}:{found.start[0]} {found.function}"
+            print(f"{result} {place}: {found.text.strip()}", flush=True)
+    for room in sorted({room for room, _ in counts}):
+        print(f"{room:14}", *(f"{result} {counts[room, result]:3}" for result in ("noticed", "MISSED", "no time")))
+    sums = Counter(dict.fromkeys(("noticed", "MISSED", "no time"), 0))
+    for (_, result), number in counts.items():
+        sums[result] += number
+    noticed, decided = sums["noticed"], sums["noticed"] + sums["MISSED"]
+    print(f"noticed {noticed} of {decided}, {noticed / max(decided, 1):.0%}; {sums['no time']} not within the limit")
     return 0
 
 

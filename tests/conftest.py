@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchreg.alignment.results import AlignResult
-from torchreg.datasets.hand import surface_skin
+from torchreg.datasets import hand as made
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.result import Status
@@ -29,7 +29,7 @@ PARTS = {
 # Long runs of everything together. Tracing slows them most, and their parts have tests of their own, which are traced.
 UNTRACED = {
     "benchmarks", "docs", "experiments", "web", "test_align_scans.py", "test_bad_input.py", "test_calibrate.py",
-    "test_clouds.py", "test_compiled_shapes.py", "test_default_dtypes.py", "test_degenerate_data.py", "test_descent.py",
+    "test_clouds.py", "test_compiled_shapes.py", "test_contracts.py", "test_degenerate_data.py", "test_descent.py",
     "test_em_loss.py", "test_extract_spine.py", "test_far_coordinates.py", "test_find_pose.py", "test_loaded_data.py",
     "test_poses_from_skeletons.py", "test_prior.py", "test_search.py", "test_shapes_as_modules.py", "test_storage.py",
     "test_tip_correspondences.py", "test_track.py",
@@ -70,7 +70,7 @@ def plain_hand_skin(plain_hand):
 @pytest.fixture(scope="session")
 def plain_hand_surface(plain_hand):
     """The hand's whole surface as a skin with faces, from which clouds are drawn."""
-    return surface_skin(plain_hand, spacing=0.005)
+    return made.surface_skin(plain_hand, spacing=0.005)
 
 
 @pytest.fixture(scope="session")

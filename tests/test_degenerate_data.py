@@ -1,19 +1,12 @@
 """Data at one place, on a line or on a plane, are never called converged, and coarse rounding is told."""
 
-import copy
-
 import pytest
 import torch
 
 import torchreg as tr
-from torchreg.errors import DegenerateDataWarning, InputError, PrecisionWarning
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from tests import bodies
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.geometry.spread import spread_dimensions
-from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.shapes.primitives import Primitive
 
-QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100), num_samples=150)
 SEARCH = tr.FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1, num_model_points=60)
 DRAWN = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
 CLOUDS = {
@@ -31,30 +24,12 @@ def cloud(request):
 
 @pytest.fixture(scope="module")
 def finger():
-    eye = torch.eye(4, dtype=torch.float64)
-    knuckle = eye.clone()
-    knuckle[2, 3] = 0.05
-    tree = KinematicTree((
-        Joint("body", -1, eye), Joint("finger", 0, knuckle, "revolute", (0.8, 0.6, 0.0), -0.5, 1.2)
-    ))  # fmt: skip
-    solids = [Primitive("ellipsoid", (0.05, 0.03, 0.06), eye), Primitive("ellipsoid", (0.012, 0.015, 0.04), eye)]
-    return tr.ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004)
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.7])
-def test_dimensions_are_counted_whatever_the_direction(turn):
-    cosine, sine = torch.tensor(turn).cos(), torch.tensor(turn).sin()
-    rotation = torch.tensor([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-    clouds = torch.stack([points for points, _ in CLOUDS.values()] + [DRAWN]) @ rotation + 5
-    assert spread_dimensions(clouds, 1.0).tolist() == [0, 0, 1, 2, 3]
-    valid = torch.ones(200, dtype=torch.bool)
-    valid[2:] = False
-    assert int(spread_dimensions(DRAWN, 1.0, valid)) == 1
+    return bodies.finger()
 
 
 def test_alignment_tracker_and_calibration_say_what_is_wrong(finger, cloud):
     data, where = cloud
-    with pytest.warns(DegenerateDataWarning, match=f"lie {where}.* determine no pose"):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=f"lie {where}.* determine no pose"):
         found = tr.align(finger, data, finger.rest_pose(), config=tr.AlignConfig(search="never"))
     assert found.status is tr.Status.DEGENERATE
     assert not found.status.usable
@@ -62,15 +37,15 @@ def test_alignment_tracker_and_calibration_say_what_is_wrong(finger, cloud):
 
 def test_tracker_and_calibration_say_it_too(finger):
     data, where = CLOUDS["plane"]
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         assert set(tr.Tracker(finger).run([data, data]).statuses) == {tr.Status.DEGENERATE}
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         assert tr.calibrate(finger, [data, data], finger.rest_pose().repeat(2, 1)).status is tr.Status.DEGENERATE
 
 
 def test_nothing_is_confident(finger, cloud):
     data, where = cloud
-    with pytest.warns(DegenerateDataWarning, match=where):
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
         assert float(tr.find_pose(finger, data, config=SEARCH).confidence) == 0
     layer = tr.PoseInitializer(finger, tr.PoseInitializerConfig(find_pose=SEARCH))
     assert float(layer(data, start=finger.rest_pose()).confidence) == 0
@@ -79,15 +54,15 @@ def test_nothing_is_confident(finger, cloud):
 def test_scans_that_may_slide_are_told(cloud):
     data, where = cloud
     if where == "at one place":
-        with pytest.raises(InputError, match="3 places or more"):
+        with pytest.raises(tr.errors.InputError, match="3 places or more"):
             tr.RangeScan(data)
         return
-    with pytest.warns(DegenerateDataWarning, match=where):
-        found = tr.register(tr.RangeScan(data), tr.RangeScan(data + 0.01), 2, 8, QUICK)
+    with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
+        found = tr.register(tr.RangeScan(data), tr.RangeScan(data + 0.01), 2, 8, bodies.QUICK)
     assert not found.status.usable
     if where == "on a plane":
-        with pytest.warns(DegenerateDataWarning, match=where):
-            found = tr.register_sequence([tr.RangeScan(data), tr.RangeScan(data + 0.01)], 2, 8, QUICK)
+        with pytest.warns(tr.errors.DegenerateDataWarning, match=where):
+            found = tr.register_sequence([tr.RangeScan(data), tr.RangeScan(data + 0.01)], 2, 8, bodies.QUICK)
         assert found.status is tr.Status.DEGENERATE
 
 
@@ -98,15 +73,8 @@ def test_a_flat_surface_has_a_note():
     assert tr.extract_spine([flat], workers=1).status is not tr.Status.CONVERGED
 
 
-def test_single_precision_far_away_is_told_and_double_is_exact(finger):
-    config = tr.AlignConfig(search="never")
-    near = tr.sample_skin(finger, 150)(finger.rest_pose()).detach()
-    offset = torch.tensor([1e4, -2e4, 1.5e4])
-    start = finger.rest_pose()
-    start[:3] = offset
-    with pytest.warns(PrecisionWarning, match="float32 rounds to 0.0024.*compute in float64"):
-        tr.align(finger, near + offset, start, config=config)
-    exact = copy.deepcopy(finger).double()
-    here = tr.align(exact, near, finger.rest_pose().double(), config=config).keypoints
-    far = tr.align(exact, near.double() + offset.double(), start.double(), config=config).keypoints
-    torch.testing.assert_close(far - offset.double(), here, rtol=0, atol=1e-8)
+def test_single_precision_far_away_is_warned_of(finger):
+    near, start = tr.sample_skin(finger, 150)(finger.rest_pose()).detach(), finger.rest_pose()
+    start[:3] = torch.tensor([1e4, -2e4, 1.5e4])
+    with pytest.warns(tr.errors.PrecisionWarning, match="float32 rounds to 0.0024.*compute in float64"):
+        tr.align(finger, near + start[:3], start, config=tr.AlignConfig(search="never"))

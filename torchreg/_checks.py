@@ -17,11 +17,7 @@ _ROUNDING_SHARE = 1e-3
 
 
 def as_tensor(value: Any, name: str, content: str) -> Tensor:
-    """Return ``value`` as a tensor of its dtype; ``content`` names the expected entries, such as "integers".
-
-    Raises:
-        InputTypeError: if ``value`` cannot become a tensor.
-    """
+    """Return ``value`` as a tensor of its dtype; ``content`` names the expected entries, such as "integers"."""
     if isinstance(value, Tensor):
         return value
     try:
@@ -31,11 +27,7 @@ def as_tensor(value: Any, name: str, content: str) -> Tensor:
 
 
 def as_float_tensor(value: Any, name: str, *, like: Tensor | None = None) -> Tensor:
-    """Return ``value`` as a floating-point tensor, on the dtype and device of ``like`` when it is given.
-
-    Raises:
-        InputTypeError: if ``value`` cannot become a tensor of real numbers.
-    """
+    """Return ``value`` as a floating-point tensor, on the dtype and device of ``like`` when it is given."""
     given, value = value, as_tensor(value, name, "numbers")
     if value.is_complex() or value.dtype == torch.bool:
         raise InputTypeError(f"{name} must hold real numbers, got dtype {value.dtype}")
@@ -47,14 +39,7 @@ def as_float_tensor(value: Any, name: str, *, like: Tensor | None = None) -> Ten
 
 
 def check_shape(value: Tensor, name: str, expected: Sequence[int | str | None], *, batch: bool = False) -> None:
-    """Raise InputError unless the trailing sizes of ``value`` are ``expected`` (None or a str: any size).
-
-    Args:
-        value: the tensor.
-        name: the argument's name, for the message.
-        expected: trailing sizes; a str names a free size in the message.
-        batch: allow leading batch dimensions.
-    """
+    """Raise InputError unless the trailing sizes of ``value`` are ``expected``; None or a str is any size."""
     got = tuple(value.shape)
     trailing = got[len(got) - len(expected) :] if len(got) >= len(expected) else ()
     fits = len(trailing) == len(expected) and (batch or len(got) == len(expected))
@@ -131,14 +116,7 @@ def check_same_kind(value: Tensor, name: str, like: Tensor, like_name: str) -> N
 
 
 def warn_about_rounding(points: Tensor, name: str, size: float, *, stacklevel: int) -> None:
-    """Warn with a `PrecisionWarning` if points lie so far from the origin that their dtype rounds them coarsely.
-
-    Args:
-        points: (..., 3), finite.
-        name: of the argument.
-        size: of what they are points of, in their unit.
-        stacklevel: of the warning: 1 for the caller.
-    """
+    """Warn if the dtype rounds points (..., 3) of something of a ``size`` coarsely, so far from the origin."""
     distance = float(points.detach().abs().max()) if points.numel() else 0.0
     rounding = distance * torch.finfo(points.dtype).eps
     if rounding > _ROUNDING_SHARE * size:

@@ -69,12 +69,8 @@ if hasattr(os, "register_at_fork"):
 def one_thread(only: bool = True) -> Iterator[None]:
     """Let torch use one thread on the CPU for the work of the calling Python thread in a ``with`` block.
 
-    Waking further threads takes longer than operations on small tensors, and where other programs keep the cores busy,
-    several threads wait for each other most of the time. `run_both` still runs two pieces of work at once where torch
-    could use more threads before.
-
-    Args:
-        only: whether the work is on small tensors; False changes nothing.
+    Waking further threads takes longer than operations on small tensors. `run_both` still runs two pieces of work at
+    once where torch could use more threads before. Not ``only``: nothing changes.
     """
     if not only or _is_single():
         yield
@@ -88,14 +84,10 @@ def one_thread(only: bool = True) -> Iterator[None]:
 
 
 def run_both(first: Callable[[], _First], second: Callable[[], _Second]) -> tuple[_First, _Second]:
-    """Return the results of two calls, the second made at the same time by another thread if torch may use several.
+    """Return the results of two independent calls, the second made at the same time by another thread if torch may.
 
     The two calls share the caller's threads. Gradients are recorded as in the caller. An error of the first call is
     raised when the second has ended.
-
-    Args:
-        first: called in the calling thread.
-        second: called in a thread beside it; must not depend on the first.
     """
     allowed = _num_allowed()
     if allowed < 2:

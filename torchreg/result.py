@@ -23,12 +23,7 @@ def public(name: str) -> Any:
 
 
 def stored_as(to_record: Callable[[Any], Any], from_record: Callable[[Any], Any]) -> dict[str, Any]:
-    """Return the metadata of a result's field that is not plain data, such as a module.
-
-    Args:
-        to_record: from its value to a dataclass of tensors and plain data, annotated with that class.
-        from_record: the inverse.
-    """
+    """Return the metadata of a field that is not plain data: functions to an annotated dataclass of it, and back."""
     return {"to_record": to_record, "from_record": from_record}
 
 

@@ -74,24 +74,11 @@ def load(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -
 
 
 def load_pose(path: str | os.PathLike[str], shape: ArticulatedShape, *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
-    """Return a pose (num_dofs,) of a shape from a file.
+    """Return a pose (num_dofs,) of a shape from a file, in the shape's dtype unless that would round it noticeably.
 
-    Args:
-        path: a saved `AlignResult`, or `TrackResult` for its last pose (.safetensors or its .json); or .json with a
-            list of num_dofs numbers, or with values by name of degree of freedom, the others at rest; or .csv with a
-            line of such names, of which the last row that is complete counts; or .npz with an array ``pose``, or a
-            single array.
-        shape: of the pose.
-        limits: on the size of the file.
-
-    Returns:
-        The pose, metres and radians, on the shape's device, and in its dtype unless that would round it noticeably, far
-        from the origin.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        FormatError: if the file is damaged, or holds no pose.
-        InputError: if the pose is not finite or does not fit the shape; names the file.
+    A saved `AlignResult`, or `TrackResult` for its last pose (.safetensors or its .json); or .json with a list of
+    num_dofs numbers, or with values by name of degree of freedom, the others at rest; or .csv with a line of such
+    names, of which the last row that is complete counts; or .npz with an array ``pose``, or a single array.
     """
     file = local_path(path)
     readers = {
@@ -272,12 +259,7 @@ def _can_stack(column: Sequence[Any]) -> bool:
 
 
 class _Decoder:
-    """Builds records of plain data.
-
-    Args:
-        tensors: of the file, by name.
-        known: records and enumerations that may be built, by name.
-    """
+    """Builds records of plain data: of the tensors of a file and the kinds that may be built, both by name."""
 
     def __init__(self, tensors: Mapping[str, Tensor], known: Mapping[str, type]) -> None:
         self.tensors, self.known = tensors, known

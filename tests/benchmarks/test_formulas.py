@@ -119,38 +119,6 @@ def test_logistic_models_find_the_odds_that_made_the_cases(load):
     assert (bench.left_out(evidence, evidence[:, 0] < 0.5) > 0.5).tolist() == [True] * 3 + [False] * 3
 
 
-def test_confidence_is_judged_by_cases_of_other_halves_and_kinds(load, tmp_path):
-    bench, generator = load("confidence"), torch.Generator().manual_seed(1)
-    case = bench.Case("hand", True, tr.Status.CONVERGED, 0.01, torch.zeros(8), 0.95, True, 0.1, 0, torch.zeros(27))
-    unknown = torch.rand(400, generator=generator)
-    wrong = torch.rand(400, generator=generator) < unknown
-    cases = [
-        bench.replace(case, kind=kind, evidence=value * torch.eye(8)[5], error=float(is_wrong))
-        for kind, value, is_wrong in zip(["hand", "arm"] * 200, unknown, wrong, strict=True)
-    ]
-    for held_out in (bench.reliability(bench.crossed(cases)), bench.left_out(cases).splitlines()):
-        assert "FAIL" not in "\n".join(held_out)
-    assert "calibrated without arm" in held_out[0]
-    # All are as sure, which nothing supports.
-    assert "FAIL" in bench.reliability([bench.replace(entry, confidence=0.95) for entry in cases])[1]
-    bench.draw(cases[:2], tmp_path / "r.png")
-    assert (tmp_path / "r.png").stat().st_size > 1000
-
-
-def test_tables_of_reliability(load):
-    right = tensor([True, True, True, False, False])
-    lines, met = load("shape_confidence").render(tensor([0.9, 1.0, 0.7, 0.1, 0.6]), right)
-    assert "5 cases, 3 right: area under the curve 1.000; 3 right and sure, 1 wrong and sure" in lines
-    assert "0.8 to 1.0:   2 cases, mean confidence 0.95, right 1.00" in lines
-    assert not met  # a quarter of what it is sure of is wrong
-    assert load("shape_confidence").render(tensor([0.9, 0.95, 0.7, 0.1, 0.4]), right)[1]
-    bench = load("pose_initializer")
-    table = bench.reliability(tensor([0.1, 0.9, 1.0]), tensor([False, True, False])).split()
-    assert " ".join(table).endswith("0.0 to 0.2 1 0.0% 0.8 to 1.0 2 50.0%")
-    cases = bench.by_case(["b", "a", "b"], tensor([0.01, 0.2, 0.02]), tensor([True, False, True])).splitlines()
-    assert [" ".join(row.split()[:5]) for row in cases] == ["a 1 clouds, right 0.0%,", "b 2 clouds, right 50.0%,"]
-
-
 def row_of(bench, errors, seen, confidence, case="front", seconds=1.0):
     seconds = torch.full((len(errors),), seconds).double()
     return bench.Row(case, tensor(errors), tensor(seen), tensor(confidence), seconds)
@@ -192,11 +160,3 @@ def test_claims_on_rivals_follow_from_paired_alignments(load):
     assert bench.faster_claim(fast, "", "a", "b").verdict == "CONFIRMED"
     assert bench.faster_claim(fast, "", "b", "a").verdict == "CONTRADICTED"
     assert bench.falls_claim(fast, "", "a", "b").verdict == "NOT DECIDED"
-
-
-def test_tracks_are_judged_by_visible_fingertips_and_losses_in_view(load):
-    bench, errors = load("tracking"), tensor([[1.0, 2, 3, 4, 50], [1, 9, 1, 1, 1]])
-    seen = tensor([[True] * 4 + [False], [True] * 5])
-    result = SimpleNamespace(statuses=(tr.Status.LOST, tr.Status.CONVERGED))
-    tracked, hidden = (bench.Track(result, errors, seen, tensor([visible, True])) for visible in (True, False))
-    assert (tracked.worst.tolist(), tracked.lost, hidden.lost) == ([4, 9], 1, 0)

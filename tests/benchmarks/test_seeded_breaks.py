@@ -34,4 +34,5 @@ def test_each_break_is_another_program(bench, checkout):
 def test_a_break_is_noticed_by_the_test_of_its_module(bench, checkout):
     minus = next(item for item in bench.drawn(20, 0, checkout) if item.text == " + ")
     assert bench.tests_of(minus, checkout) == ["tests/room/test_near.py"]
-    assert bench.is_noticed(minus, checkout, 60)
+    assert bench.outcome(minus, checkout, 60) == "noticed"
+    assert (checkout / minus.file).read_text() == SOURCE

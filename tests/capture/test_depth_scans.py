@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import torchreg as tr
+from experiments.made_up.depth_noise import DepthNoise
 from torchreg.capture.depth import bilateral_filter, plane_normals, without_flying_pixels
-from torchreg.capture.depth_noise import DepthNoise
 from torchreg.geometry.rigid import se3_exp
 from torchreg.io.calibration import save_depth_camera
 from torchreg.io.images import save_depth
@@ -80,17 +80,6 @@ def test_flying_pixels_go_and_surfaces_stay():
     assert not without_flying_pixels(alone, (150.0, 150.0)).any()
 
 
-def test_most_pixels_of_a_time_of_flight_camera_that_fly_are_found():
-    truth = torch.full((60, 80), 1.5)
-    truth[20:40, 20:50] = 0.8
-    noisy = DepthNoise(flying=1.0).measured(truth)
-    flies = (noisy - truth).abs() > 0.05
-    clean = without_flying_pixels(noisy, (150.0, 150.0))
-    assert flies.sum() > 50
-    assert (clean[flies] == 0).float().mean() > 0.85
-    assert (clean[~flies] > 0).float().mean() > 0.98
-
-
 def test_bilateral_filter_calms_noise_but_not_edges_and_slopes():
     generator = torch.Generator().manual_seed(0)
     truth = torch.full((40, 40), 1.0)
@@ -119,12 +108,6 @@ def test_plane_normals_are_exact_on_planes():
     found[50, 50] = normal
     assert torch.allclose(found, normal.expand_as(found), atol=1e-6)
     assert not plane_normals(depth[50:51, 50:52], CAMERA.intrinsics.tolist(), 1e-3).any()
-
-
-def test_depth_range_cuts_the_background():
-    depth, _ = solid("sphere")
-    scan = tr.depth_scan(torch.where(depth > 0, depth, 3.0), CAMERA, farthest=1.0, nearest=0.1)
-    assert len(scan) <= (depth > 0).sum()
 
 
 @pytest.mark.parametrize(
@@ -187,56 +170,3 @@ def test_files_become_scans(tmp_path):
     (tmp_path / "k.json").write_text(json.dumps({"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 0, "cy": 0}))
     with pytest.raises(tr.errors.FormatError, match="is 160 x 120 pixels, the camera's pictures are 1 x 1"):
         tr.load_depth_scan(tmp_path / "d.png", tmp_path / "k.json")
-
-
-@pytest.mark.parametrize("noise", [DepthNoise.structured_light(), DepthNoise.time_of_flight()])
-@pytest.mark.parametrize("distance", [0.6, 2.0])
-def test_spread_is_what_depth_std_says(noise, distance):
-    flat = torch.full((150, 150), distance, dtype=torch.float64)
-    seen = noise.measured(flat)
-    error = seen[seen > 0] - distance
-    assert float(error.std()) == pytest.approx(float(noise.depth_std(flat[0, 0])), rel=0.1)
-    assert float(error.mean().abs()) < 0.1 * float(error.std()) + 0.5 * noise.step * distance**2
-    assert float((seen == 0).double().mean()) == pytest.approx(noise.dropout, abs=0.005)
-
-
-def test_depths_come_in_steps_of_nearness():
-    seen = DepthNoise(step=0.1).measured(torch.linspace(1.0, 2.0, 100).reshape(10, 10))
-    steps = 1 / seen / 0.1
-    assert torch.allclose(steps, steps.round(), atol=1e-4)
-
-
-def test_flying_pixels_hang_between_the_two_sides():
-    truth = torch.full((20, 20), 2.0)
-    truth[5:15, 5:15] = 1.0
-    seen = DepthNoise(flying=1.0).measured(truth)
-    between = (seen > 1.0) & (seen < 2.0)
-    assert between.sum() == 36
-    assert torch.equal(between, between & (truth == 1.0))
-
-
-def test_jitter_ruffles_edges_only():
-    truth = torch.full((20, 20), 2.0)
-    truth[:, 10:] = 1.0
-    seen = DepthNoise(jitter=0.5).measured(truth)
-    moved = (seen != truth).nonzero()[:, 1]
-    assert len(moved)
-    assert ((moved - 9.5).abs() < 4).all()
-
-
-def test_nothing_stays_nothing_and_seeds_decide():
-    empty = torch.tensor([[0.0, torch.nan], [torch.inf, -1.0]])
-    noise = DepthNoise.time_of_flight()
-    assert not noise.measured(empty).any()
-    flat = torch.ones(2, 5, 5)
-    assert torch.equal(noise.measured(flat), noise.measured(flat))
-    other = noise.measured(flat, torch.Generator().manual_seed(1))
-    assert not torch.equal(noise.measured(flat), other)
-    assert torch.equal(DepthNoise().measured(flat), flat)
-
-
-def test_numbers_are_checked():
-    with pytest.raises(tr.errors.InputError, match="quadratic must be zero or positive"):
-        DepthNoise(quadratic=-1.0)
-    with pytest.raises(tr.errors.InputError, match="flying is a share"):
-        DepthNoise(flying=1.5)

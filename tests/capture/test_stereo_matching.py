@@ -50,15 +50,6 @@ def test_subpixel_shift_is_found():
     assert float(found[:, 20:].nanmedian()) == pytest.approx(6.75, abs=0.2)
 
 
-def test_batches_and_dtypes():
-    left, right, _ = scene()
-    both = match_disparity(torch.stack((left, left)), torch.stack((right, right)), 20)
-    one = match_disparity(left, right, 20)
-    assert torch.equal(both[1].nan_to_num(-1), one.nan_to_num(-1))
-    single = match_disparity(left.float(), right.float(), 20)
-    assert single.dtype == torch.float32
-
-
 def test_census_ignores_brightness_and_counts_darker_neighbors():
     image = textured(12, 15)
     assert torch.equal(census(image), census(3 * image + 1))

@@ -116,17 +116,6 @@ def test_rectified_pictures_of_a_turned_pair_with_lenses_match():
     assert off.median() < 3e-3
 
 
-def test_rectify_undoes_lenses():
-    pair = stereo_cameras(width=60, height=40, focal=60.0)
-    bent = tr.Camera(60, 40, pair.left.intrinsics, pair.left.world_to_camera, (-0.2, 0.05, 0.0, 0.0))
-    ramp = pair.left.pixel_grid()[..., 0] / 60
-    first, _, straight = rectify(ramp, ramp.unsqueeze(-1).expand(-1, -1, 3), tr.StereoPair(bent, pair.right))
-    assert straight.is_rectified
-    source, _ = bent.project(bent.position + straight.left.directions(straight.left.pixel_grid()))
-    inner = (slice(10, 30), slice(10, 50))
-    assert torch.allclose(first[inner], source[..., 0][inner] / 60, atol=1e-6)
-
-
 def test_swapped_strange_and_wrongly_sized_pictures_are_refused(scene):
     pair, left, right, _ = scene
     with pytest.raises(InputError, match="left and right pictures are swapped"):
@@ -210,18 +199,6 @@ def test_frames_come_in_order_as_points_on_the_ball(folders, pair):
     assert sight is frames.sight(1)
     assert torch.equal(sight.points.points.float(), clouds[1])
     assert sight.left.shape == (120, 160, 3)
-
-
-def test_pictures_of_a_turned_pair_are_rectified(pair, tmp_path):
-    twist = torch.tensor([0.0, 0.002, 0.0, 0.01, -0.02, 0.01], dtype=torch.float64)
-    turned = tr.Camera(160, 120, pair.right.intrinsics, se3_exp(twist) @ pair.right.world_to_camera)
-    crooked = tr.StereoPair(pair.left, turned)
-    for name, image in zip(("left", "right"), ball_at(0.0, (pair.left, turned)), strict=True):
-        (tmp_path / name).mkdir()
-        save_image(tmp_path / name / "0.png", image)
-    cloud = tr.StereoFrames(tmp_path / "left", tmp_path / "right", crooked, config=NEAR_BALL)[0]
-    assert len(cloud) > 20
-    assert ((cloud - torch.tensor([0.0, 0.0, 0.6])).norm(dim=-1) - 0.1).abs().median() < 3e-3
 
 
 def test_what_comes_in_through_the_border_is_cut_off(pair):

@@ -69,22 +69,6 @@ def test_a_bar_hides_the_passing_hand(plain_hand, skin):
         assert float(on_bar[:, 1].std()) > 2 * float(on_bar[:, 0].std())
 
 
-def test_double_precision_defaults_and_no_poses(plain_hand, skin):
-    hand = tr.Hand("left", dtype=torch.float64)
-    options = {"skin": made.surface_skin(hand, spacing=0.012), "stereo": SMALL}
-    (cloud,) = sequences.hand_sequence("flip", 1, shape=hand, num_points=40, **options)
-    assert cloud.points.dtype == cloud.pose.dtype == cloud.vertices.dtype == torch.float64
-    assert not cloud.points.requires_grad
-    assert stereo.stereo_clouds(hand, cloud.pose[None][:0], **options) == []
-    (cloud,) = sequences.hand_sequence(num_frames=1, num_points=60)
-    assert int(cloud.inliers.sum()) == 60
-    assert len(cloud.points) == 60 + 26
-    poses = made.hand_motion(plain_hand, "rotate", 3, seed=3)
-    clouds = sequences.range_clouds(plain_hand, poses, skin=skin, num_points=60, camera=torch.zeros(3), seed=3)
-    assert torch.equal(torch.stack([cloud.pose for cloud in clouds]), poses)
-    assert not torch.equal(clouds[0].points, clouds[1].points)
-
-
 @pytest.mark.parametrize("depth", [0.4, 1.2])
 def test_the_pair_is_rectified_and_noise_is_that_of_disparity_and_pixels(depth):
     """Measured in the pictures, whatever the depth, the noise is the given one."""

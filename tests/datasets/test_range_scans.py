@@ -64,19 +64,6 @@ def test_missing_parts_are_missing_in_every_other_frame(toy):
     assert not bool(toy.pair(1, 2).missing.any())
 
 
-def test_every_way_to_ask_gives_the_same(toy):
-    pairs, alone = list(toy.pairs(2)), toy.pair(3, 5)
-    assert len(pairs) == 6
-    for name in ("truth", "labels", "target_labels", "joints", "visible"):
-        assert torch.equal(getattr(pairs[3], name), getattr(alone, name))
-    for one, other in (
-        (alone.source.points, toy[3].points), (alone.target.points, toy[5].points), (alone.truth, toy.truth(3, 5)),
-        (alone.labels, toy.labels(3)), (alone.joints, toy.joints(3)), (toy[-1].points, toy[7].points),
-    ):  # fmt: skip
-        assert torch.equal(one, other)
-    assert all(isinstance(frame, tr.RangeScan) for frame in toy)
-
-
 def test_a_clean_scan_lies_exactly_where_it_says():
     found, single = scan(CLEAN), scan(CLEAN, dtype=torch.float32)
     assert single.scan.points.dtype == torch.float32
@@ -120,3 +107,16 @@ def test_what_stands_before_something_hides_it():
     shadow = (behind[:, 0] / behind[:, 2]).abs() < 0.1 / 2 - 0.01
     low = (behind[:, 1] / behind[:, 2]).abs() < 0.6 / 2 - 0.05
     assert not bool((shadow & low).any())
+
+
+def test_every_way_to_ask_gives_the_same(toy):
+    pairs, alone = list(toy.pairs(2)), toy.pair(3, 5)
+    assert len(pairs) == 6
+    for name in ("truth", "labels", "target_labels", "joints", "visible"):
+        assert torch.equal(getattr(pairs[3], name), getattr(alone, name))
+    for one, other in (
+        (alone.source.points, toy[3].points), (alone.target.points, toy[5].points), (alone.truth, toy.truth(3, 5)),
+        (alone.labels, toy.labels(3)), (alone.joints, toy.joints(3)), (toy[-1].points, toy[7].points),
+    ):  # fmt: skip
+        assert torch.equal(one, other)
+    assert all(isinstance(frame, tr.RangeScan) for frame in toy)

@@ -8,7 +8,6 @@ pytest.importorskip("hydra", reason="experiments take the extra experiments")
 
 from experiments import command_line
 from experiments.command_line import application, main
-from experiments.worker import Outcome
 
 
 @pytest.fixture
@@ -117,17 +116,6 @@ def test_errors_are_one_line(arguments, message, monkeypatch, capsys, tmp_path):
     assert printed.count("\n") == 1
 
 
-def test_interrupting_says_that_nothing_is_lost(monkeypatch, capsys):
-    def interrupted():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command_line, "application", interrupted)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 130
-    assert "finished trials are kept" in capsys.readouterr().err
-
-
 def test_damaged_and_foreign_records_are_reported(command, sweep_file, tmp_path, inline, monkeypatch):
     command("sweep", sweep_file)
     next(iter((tmp_path / "results/mine/trials").glob("*.json"))).write_text("{")
@@ -137,15 +125,3 @@ def test_damaged_and_foreign_records_are_reported(command, sweep_file, tmp_path,
     printed = command("sweep", sweep_file, "size=5")
     assert "4 records of other configurations of this sweep are kept beside them" in printed
     assert "set aside and run again: " in command("sweep", sweep_file)
-
-
-def test_a_sweep_that_no_process_can_run_ends_with_an_error(command, sweep_file, monkeypatch):
-    class Dead:
-        def run(self, jobs):
-            yield from (Outcome(job.id, "lost") for job in jobs)
-
-        def close(self):
-            pass
-
-    monkeypatch.setattr(command_line, "make_engine", lambda name, options: Dead())
-    assert "4 trials have no result" in command("sweep", sweep_file, code=1)

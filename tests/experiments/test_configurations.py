@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("hydra", reason="experiments take the extra experiments")
 
-from experiments.compose import CONFIGS, from_data, known_configs, load_sweep
+from experiments.compose import CONFIGS, known_configs, load_sweep
 from experiments.errors import ConfigError
 from experiments.plan import axes_of, planned_trials, trial_id
 from experiments.registry import TASKS
@@ -55,18 +55,13 @@ def test_plain_data_become_dataclasses_and_come_back():
         ({"nam": "x"}, r"unknown key nam; known keys: extra, inner, name, on, ratio, values; did you mean name\?"),
         ({}, "name is missing"),
         ({"name": 3}, "name must be a text, got int 3"),
-        ({"inner": {"size": "4"}}, "inner.size must be an integer, got str '4'"),
         ({"inner": {"size": True}}, "inner.size must be an integer, got bool True"),
-        ({"inner": {"size": 1.5}}, "inner.size must be an integer, got float 1.5"),
         ({"inner": {"kind": "c"}}, "inner.kind must be one of a, b, got str 'c'"),
-        ({"inner": 3}, "inner must be a mapping, got int 3"),
         ({"inner": {"size": -1}}, "inner.size must not be negative"),
         ({"ratio": "many"}, "ratio must be a number, got str 'many'"),
         ({"ratio": float("nan")}, "ratio must be finite"),
-        ({"values": 3}, "values must be a list, got int 3"),
         ({"values": [1, "b"]}, r"values\[1\] must be a number, got str 'b'"),
         ({"on": 1}, "on must be true or false, got int 1"),
-        ({"extra": []}, "extra must be a mapping"),
         ([1], "the configuration must be a mapping"),
     ],
 )
@@ -74,19 +69,6 @@ def test_wrong_data_are_named(data, message):
     named = {"name": "x", **data} if isinstance(data, dict) and data and "nam" not in data else data
     with pytest.raises(ConfigError, match=message):
         build(Outer, named)
-
-
-@pytest.mark.parametrize(
-    ("key", "message"),
-    [
-        ("inner.sizes", r"unknown key trial.inner.sizes; known keys of trial.inner: kind, size, width"),
-        ("other.size", r"unknown key trial.other; known keys of trial: extra, inner"),
-        ("name.size", r"unknown key trial.name.size"),
-    ],
-)
-def test_dotted_keys_must_lead_to_a_field(key, message):
-    with pytest.raises(ConfigError, match=message):
-        updated(Outer("x"), {key: 1})
 
 
 def test_cases_times_grid_times_seeds(probe_sweep):
@@ -175,35 +157,22 @@ def test_command_lines_replace_and_sweep_fields(folder, overrides, grid):
     assert load_sweep("probe/big", ["size=8"], root=folder).trial.size == 8
 
 
-def test_nested_fields_and_the_librarys_own_settings_are_swept():
-    found = load_sweep("alignment/sigma_range_smoke", ["schedule.start=0.04,0.06", "config.outlier=1.0,limit"])
-    trials = planned_trials(found)
-    assert {trial.config["schedule"]["start"] for trial in trials} == {0.04, 0.06}
-    assert {trial.config["config"]["outlier"] for trial in trials} == {1.0, "limit"}
-
-
 @pytest.mark.parametrize(
     ("name", "override", "message"),
     [
         ("sigma", "schedule.strt=0.04,0.06", r"unknown key trial.schedule.strt; .* start, steps, stop; did"),
         ("sigma", "schedule.start=0.04,-1", "schedule.start was given on the command line, .*: kappa, kind"),
-        ("sigma", "schedule.start=-1", "schedule.start was given on the command line, .*: kappa, kind"),
         ("sigma", "schedule.start=0.04,wide", "trial.schedule.start must be a number, got str 'wide'; .* kappa, kind"),
         ("sigma", "schedule.start=", "schedule.start is given no value; write schedule.start=VALUE, or .* to sweep it"),
-        ("sigma", "schedule.start=,", "schedule.start is given no value"),
         ("sigma", "seeds=1,2", "seeds takes one value"),
-        ("sigma", "schedule.start.more=1,2", "unknown key trial.schedule.start.more"),
         ("sigma", "config.outlir=1,2", "unknown key trial.config.outlir; known keys of trial.config: .*mean outlier"),
         ("sigma", "config.outlier=-1.0,2.0", "trial.config.outlier: outlier must be positive .*; known keys of"),
         ("sigma", "config.schedule.values=1,2", "unknown key trial.config.schedule.values"),
         ("bones", "grid_resolution=20,1000", "grid_resolution must be at most 256, got 1000; .*: config, grid"),
         ("bones", "num_bones=0,4", "num_bones must be at least 1, got 0"),
-        ("bones", "config.num_samples=0,4", "num_samples must be at least 1"),
         ("probe", "sizes=8", r"unknown key trial.sizes; known keys of trial: .*rounds.*size.*did you mean size\?"),
-        ("probe", "size=big", "trial.size must be an integer, got str 'big'"),
         ("probe", "seeds=0", "seeds must be at least 1"),
         ("probe", "seeds", "write key=value"),
-        ("probe", "~trial.size=1", "write key=value"),
         ("probe", "trial.size=[1", "big.yaml cannot be read"),
         ("probe", "task=sculpture", "unknown task 'sculpture'; known tasks: alignment, neural_init, papers, probe"),
         ("probe", "report.colour=red", "unknown key report.colour; known keys of report: curve_log"),
@@ -224,12 +193,9 @@ BOMB = [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
     ("text", "message"),
     [
         ("task: [probe", "cannot be read"),
-        ("- a\n- b\n", "cannot be read|must hold a mapping"),
         ("task: probe\nquestion: q\nsead: 1\n", "unknown key sead; known keys: cases, grid, name"),
         ("question: q\n", "task must be the name of a task, got None"),
         ("task: probe\n", "question is missing"),
-        ("defaults: [missing]\ntask: probe\n", "cannot be read"),
-        ("task: probe\nquestion: q\ntrial: {size: ${nowhere}}\n", "cannot be read"),
         # Hostile ones: nothing in a file is called, and nothing grows without a bound.
         ("task: probe\nquestion: q\ntrial: {_target_: os.system}\n", r"unknown key trial\._target_"),
         ("\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x, x]", *BOMB]), "more than 100000 values, aliases included"),
@@ -246,11 +212,6 @@ def test_wrong_files_are_named(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         load_sweep("wrong", root=tmp_path)
     assert time.perf_counter() - begin < 5
-
-
-def test_a_wrong_value_in_plain_data_is_named():
-    with pytest.raises(ConfigError, match=r"report\.heat must name two axes"):
-        from_data({"name": "x", "task": "probe", "question": "q", "report": {"heat": ["a"]}})
 
 
 def test_no_task_has_a_field_that_a_sweep_has_too():

@@ -14,11 +14,9 @@ import pytest
 from experiments.driver import run_sweep
 from experiments.engines.base import EngineConfig, share_code, visible_gpus
 from experiments.engines.by_name import make_engine
-from experiments.errors import ConfigError, ExperimentError, StoreError
-from experiments.plan import planned_trials
-from experiments.schema import AlignmentTrial, AlignSolver, HandScene, ProbeTrial, ScheduleConfig, SweepConfig
+from experiments.errors import ConfigError, ExperimentError
+from experiments.schema import ProbeTrial
 from experiments.store import Store
-from experiments.worker import Job
 
 ENGINES = {"local": (), "ray": (), "slurm": ("--slurm", "cluster=local")}
 SWEEP = """
@@ -122,48 +120,6 @@ def test_a_killed_worker_does_not_stop_the_sweep(engine_name, store, probe_sweep
     assert [records[name].status for name in ("done", "killed once", "killed")] == ["done", "done", "failed"]
     assert "died 3 times" in records["killed"].note
     assert records["killed once"].attempt == 2
-
-
-def test_all_engines_find_the_same_bit_for_bit(tmp_path, ray_cluster, monkeypatch, inline_engine):
-    monkeypatch.setenv("RAY_ADDRESS", ray_cluster)
-    solver = AlignSolver(em_steps=1, num_model_points=60)
-    trial = AlignmentTrial(
-        scene=HandScene(view="tracked", num_points=60), schedule=ScheduleConfig(steps=2), solver=solver
-    )
-
-    def found(name, kind="geometric"):
-        sweep = SweepConfig("same", "alignment", "q", trial, grid={"schedule.kind": [kind]})
-        store, engine = Store(tmp_path / name), {"name": name, "settings": config(name, jobs=1)}
-        start = (lambda: inline_engine) if name == "none" else (lambda: make_engine(*engine.values()))
-        run_sweep(sweep, store, start, engine_name=name)
-        result = store.read(planned_trials(sweep)[0].id)
-        assert (result.status, result.engine) == ("done", name), result.traceback
-        return result.metrics, result.curves
-
-    expected = found("none")
-    assert [found(name) for name in ENGINES] == [expected] * len(ENGINES)
-    assert found("none", "adaptive") != expected
-
-
-def test_an_engine_passes_on_that_results_cannot_be_written(tmp_path):
-    """The folder is gone when the worker gets there."""
-    engine = make_engine("local", EngineConfig())
-    with contextlib.closing(engine), pytest.raises(StoreError, match=r"gone/claims/x cannot be written: No such file"):
-        list(engine.run([Job(str(tmp_path / "gone"), "probe", "x", {}, "s")]))
-
-
-def test_two_drivers_share_a_sweep(tmp_path, start_driver):
-    """Started at once, in processes of their own, over one folder."""
-    sweep, log = tmp_path / "shared.yaml", tmp_path / "log"
-    sweep.write_text(SWEEP.format(log=log, seconds=0.06))
-    drivers = [start_driver("sweep", sweep, "--results", tmp_path / "results") for _ in range(2)]
-    printed = [driver.communicate(timeout=100)[0] for driver in drivers]
-    assert [driver.returncode for driver in drivers] == [0, 0], printed
-    # Every trial began once, whoever ran it, and both drivers know all results.
-    assert len(log.read_text().splitlines()) == 24
-    records, bad = Store(tmp_path / "results/shared").records()
-    assert (len(records), bad) == (24, [])
-    assert all("24 trials: " in one for one in printed)
 
 
 def test_workers_end_with_their_driver(tmp_path, start_driver):

@@ -1,12 +1,8 @@
 """Reports of sweeps: what their page shows, the intervals in it, and the other places where records go."""
 
 import base64
-import json
 import re
-import shutil
 import sys
-import types
-from contextlib import contextmanager
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -21,12 +17,9 @@ from experiments.driver import run_sweep
 from experiments.errors import ConfigError, ExperimentError, StoreError
 from experiments.plan import planned_trials
 from experiments.records import TrialRecord, provenance
-from experiments.report import browser, charts
 from experiments.report.cells import cells_of, marginal
-from experiments.report.charts import lines_over
 from experiments.report.intervals import confidence_interval
 from experiments.report.page import write_report
-from experiments.report.plots import save_plots
 from experiments.schema import ProbeTrial, ReportConfig
 from experiments.sinks import SINKS, make_sink
 
@@ -92,14 +85,6 @@ def test_cells_hold_medians_and_quartiles_over_seeds(fill, grid):
     assert (spread.count, spread.median, spread.low, spread.high, spread.mean) == (5, 14, 11, 19, 16)
     assert cells[0].metrics["failed"].mean == pytest.approx(0.2)
     assert marginal(cells, "scale", "error_mm", share=False) == {"1": 14, "2": 24, "4": 44}
-
-
-def test_plots_over_axes_of_numbers_are_one_picture(fill, store, grid, tmp_path):
-    records = fill(grid, lambda config: config["scale"] + config["rounds"])
-    assert save_plots(grid, store, tmp_path / "plots.png").stat().st_size > 5000
-    for line in lines_over(grid, cells_of(grid, planned_trials(grid), records), "error_mm", "scale"):
-        assert all(low <= at <= high for low, at, high in zip(line.low, line.middle, line.high, strict=True))
-        assert line.middle == sorted(line.middle)
 
 
 def test_the_page_is_one_file_that_shows_everything(fill, page, grid):
@@ -175,36 +160,6 @@ def test_missing_and_foreign_records_are_named(fill, store, page, grid, probe_sw
         page(replace(grid, report=replace(grid.report, metrics=("eror_mm",))))
 
 
-def test_numbers_that_are_not_finite_leave_gaps(fill, store, page, probe_sweep):
-    sweep = probe_sweep(seeds=2)
-    store.prepare()
-    assert "6 trials have not run yet" in Reader(page(sweep)).text
-    fill(sweep, lambda config: float("nan"))
-    assert "NaN" not in re.sub(r"<script>.*?</script>", "", page(sweep).read_text(), count=1, flags=re.DOTALL)
-    assert json.loads(next(iter(store.trials.glob("*.json"))).read_text())["metrics"]["error_mm"] is None
-
-
-def test_curves_lie_at_their_steps_with_a_band_over_the_seeds(fill, probe_sweep):
-    report = ReportConfig(curves=("error_mm",), curve_steps="steps", curve_spread=True)
-    sweep = probe_sweep(grid={"scale": [1.0]}, seeds=3, report=report)
-    records = fill(sweep, lambda config: 1.0 + config["seed"])
-    found = {name: replace(one, curves=one.curves | {"steps": [0.0, 50.0]}) for name, one in records.items()}
-
-    def chart(**settings):
-        changed = replace(sweep, report=replace(report, **settings))
-        return charts.curves(changed, planned_trials(changed), found, "error_mm")
-
-    # Errors end at 1, 2 and 3, and begin at their doubles.
-    assert '"x":[0.0,50.0],"y":[4.0,2.0]' in chart()
-    assert '"x":[0.0,50.0,50.0,0.0],"y":[6.0,3.0,1.0,2.0]' in chart()
-    assert "mean, lowest and highest over all trials" in chart()
-    assert ('"type":"log"' in chart(), '"type":"log"' in chart(curve_log=True)) == (False, True)
-    assert charts.curve_names(replace(sweep, report=replace(report, curves=())), found) == ["error_mm"]
-    plain = chart(curve_steps="", curve_spread=False)
-    assert '"x":[1.0,2.0],"y":[4.0,2.0]' in plain
-    assert plain.count('"type":"scatter","x"') + plain.count('"y":[') <= 2
-
-
 def test_shares_have_the_interval_of_a_score_test():
     for count, total in ((0, 10), (3, 12), (12, 12)):
         values = [1.0] * count + [0.0] * (total - count)
@@ -229,73 +184,3 @@ def test_a_sink_whose_package_is_missing_says_so(name, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard" if name == "tensorboard" else name, None)
     with pytest.raises(ExperimentError, match=f"--sink {name} needs the package .*, which is not installed"):
         make_sink(name, "sweep", str(tmp_path))
-
-
-def fake_package(name, calls):
-    """Return the name of the module that a sink uses, and one whose functions only note their arguments."""
-
-    note = calls.append
-
-    @contextmanager
-    def start_run(run_name):
-        calls.append(run_name)
-        yield
-
-    def init(**settings):
-        calls.append(settings["name"])
-        return types.SimpleNamespace(log=calls.append, finish=lambda exit_code: calls.append(exit_code))
-
-    @contextmanager
-    def writer(folder):
-        calls.append(folder.rpartition("/")[2])
-        yield types.SimpleNamespace(
-            add_scalar=lambda *row: calls.append(row),
-            add_hparams=lambda settings, numbers, run_name: calls.append(numbers),
-        )
-
-    notes = dict.fromkeys(("set_experiment", "log_params", "log_metrics", "set_tags"), note)
-    functions = {
-        "mlflow": {**notes, "start_run": start_run}, "wandb": {"init": init}, "tensorboard": {"SummaryWriter": writer},
-    }  # fmt: skip
-    return types.SimpleNamespace(**functions[name])
-
-
-@pytest.mark.parametrize("name", ["mlflow", "wandb", "tensorboard"])
-def test_a_sink_receives_every_record(name, monkeypatch, store, probe_sweep, inline_engine):
-    calls = []
-    module = "torch.utils.tensorboard" if name == "tensorboard" else name
-    monkeypatch.setitem(sys.modules, module, fake_package(name, calls))
-    run_sweep(probe_sweep(), store, lambda: inline_engine, sinks=[make_sink(name, "probes", str(store.root))])
-    records, _ = store.records()
-    assert {record.id for record in records} <= {one for one in calls if isinstance(one, str)}
-    values = [one["value"] for one in calls if isinstance(one, dict) and "value" in one]
-    assert sorted(values) == sorted(record.metrics["value"] for record in records)
-
-
-@pytest.fixture
-def chromium():
-    pytest.importorskip("selenium")
-    if shutil.which("chromedriver") is None:
-        pytest.skip("there is no Chromium here: apt-get install chromium chromium-driver")
-
-
-def test_a_report_opens_without_a_network_and_without_complaints(chromium, fill, page, grid, tmp_path):
-    fill(grid, lambda config: config["scale"] + config["rounds"])
-    assert browser.photograph(page(grid), tmp_path / "page.png") == []
-    with Image.open(tmp_path / "page.png") as picture:
-        assert picture.width > 1000
-        # The heat map is drawn: much of the picture is neither white nor gray.
-        red, _, blue = picture.convert("RGB").resize((100, 100)).split()
-        pairs = zip(red.tobytes(), blue.tobytes(), strict=True)
-        assert sum(abs(one - other) > 60 for one, other in pairs) > 200
-    bad = tmp_path / "bad.html"
-    bad.write_text("<html><head><link rel='icon' href='data:,'></head><script>undefined_name()</script></html>")
-    (complaint,) = browser.photograph(bad, tmp_path / "bad.png")
-    assert "undefined_name is not defined" in complaint
-
-
-def test_without_chromium_it_says_what_to_install(monkeypatch, tmp_path):
-    pytest.importorskip("selenium")
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(ExperimentError, match="apt-get install chromium chromium-driver"):
-        browser.photograph(tmp_path / "a.html", tmp_path / "a.png")

@@ -1,6 +1,5 @@
 """The page of the three papers: each figure and table has a block, and a maker or a reason why not."""
 
-import math
 import re
 
 import pytest
@@ -12,7 +11,6 @@ from experiments.papers import command
 from experiments.papers.blocks import BLOCK_IDS, BLOCKS, PAIR_SETS
 from experiments.papers.table import case_name, table_rows
 from experiments.papers.trial import MAKERS, run
-from experiments.plan import planned_trials
 from experiments.records import TrialRecord
 from experiments.registry import Bench
 from experiments.schema import PaperTrial
@@ -28,24 +26,6 @@ def test_there_is_a_block_for_every_figure_and_table_which_is_made_or_says_why_n
     for block, words in (("p2-fig-3", "a drawing of the method"), ("p4-fig-1", "the papers have no such figure")):
         with pytest.raises(SkippedTrial, match=words):
             run(PaperTrial(block=block), Bench("cpu", tmp_path))
-
-
-def test_pairs_are_spread_over_a_sequence_and_run_with_the_parameters_of_table_1(tmp_path):
-    for count, wanted, expected in ((189, 189, range(189)), (46, 60, range(46)), (100, 1, [50])):
-        assert command.spread(count, wanted) == list(expected)
-    chosen = command.spread(189, 20)
-    assert len(chosen) == 20
-    assert 0 <= min(chosen) <= max(chosen) < 189
-    trials = planned_trials(command.pair_sweep(command.PapersRun(tmp_path, pairs=2)))
-    assert len({trial.id for trial in trials}) == 2 * 2 * len(PAIR_SETS)
-    car, hand = (
-        next(trial.config for trial in trials if trial.axes["case"].startswith(f"{name} as printed"))
-        for name in ("car", "hand")
-    )
-    assert (car["grid_resolution"], car["num_bones"], car["method"], car["pair"]["frames"]) == (60, 7, "paper", 90)
-    assert car["config"] == {"num_samples": 1200, "printed": {"max_distance": 20.0, "first_matches": "spin_images"}}
-    assert hand["config"]["printed"]["first_matches"] == "closest"
-    assert len(planned_trials(command.block_sweep(command.PapersRun(tmp_path)))) == len(BLOCKS)
 
 
 def test_the_table_counts_first_tries_and_retries():
@@ -82,12 +62,3 @@ def test_a_run_writes_a_page_goes_on_and_says_what_is_missing(tmp_path, inline_e
         assert line in summary
     command.make_papers(command.PapersRun(tmp_path, smoke=True), lambda: inline_engine)
     assert sum(inline_engine.ran.values()) == 2
-
-
-@pytest.mark.parametrize("block", ["p2-fig-6", "p3-fig-2"])
-def test_small_blocks_hold_pictures_and_numbers(block, tmp_path):
-    outcome = run(PaperTrial(block=block, smoke=True), Bench("cpu", tmp_path))
-    assert outcome.metrics
-    assert all(math.isfinite(value) for value in outcome.metrics.values())
-    for file in outcome.artifacts.values():
-        assert (tmp_path / file).stat().st_size > 2000

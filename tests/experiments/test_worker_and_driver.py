@@ -1,6 +1,5 @@
 """Trials in a worker and sweeps by a driver: each runs once, and whatever happens is recorded."""
 
-import errno
 import json
 import os
 import time
@@ -10,16 +9,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from experiments import driver, worker
+from experiments import worker
 from experiments.claims import claimed
 from experiments.driver import run_sweep
 from experiments.engines.base import EngineConfig
 from experiments.engines.local import LocalEngine
-from experiments.errors import StoreError
 from experiments.plan import planned_trials
 from experiments.registry import TrialOutcome
 from experiments.schema import ProbeTrial
-from experiments.worker import Job, Outcome, execute, use_threads
+from experiments.worker import Job, execute, use_threads
 
 
 @pytest.fixture
@@ -50,21 +48,6 @@ def test_a_trial_leaves_a_whole_record_and_does_not_run_again(store, make_job):
     outcome = execute(replace(job, session="t", retry=True))
     assert (outcome.state, outcome.fresh) == ("recorded", False)
     assert (path.stat().st_ino, path.stat().st_mtime_ns, path.read_bytes()) == before
-
-
-def test_failures_are_recorded_with_their_traceback_and_retried_on_request_only(store, make_job):
-    job = make_job(outcome="failed")
-    assert execute(job).status == "failed"
-    record = store.read(job.id)
-    assert record.note == "ValueError: the probe was told to fail"
-    assert 'raise ValueError("the probe was told to fail")' in record.traceback
-    assert not execute(replace(job, session="t")).fresh
-    assert execute(replace(job, session="t", retry=True)).fresh
-    # Two drivers that retry do not run it twice for one session.
-    assert not execute(replace(job, session="t", retry=True)).fresh
-    job = make_job(outcome="skipped")
-    assert execute(job).status == "skipped"
-    assert store.read(job.id).note == "there is nothing to probe"
 
 
 def test_a_trial_is_left_to_who_runs_it_and_given_up_after_ending_its_process_again_and_again(store, make_job):
@@ -100,68 +83,6 @@ def test_warnings_and_odd_numbers_are_recorded_and_threads_are_set(store, make_j
 
 def run(sweep, store, engine, **settings):
     return run_sweep(sweep, store, lambda: engine, **settings)
-
-
-def test_a_sweep_runs_once_and_a_longer_one_runs_the_rest(store, probe_sweep, inline_engine):
-    counts, new = [], []
-    options = {"on_outcome": lambda outcome, so_far: counts.append(so_far.ran), "sinks": [new.append]}
-    summary = run(probe_sweep(), store, inline_engine, **options)
-    assert (summary.planned, summary.ran, summary.kept, summary.unfinished) == (3, 3, 0, 0)
-    assert counts == [1, 2, 3]
-    assert [record.config["scale"] for record in new] == [1.0, 2.0, 3.0]
-    again = run(probe_sweep(), store, None, sinks=[new.append])
-    assert (again.ran, again.kept, again.unfinished, len(new)) == (0, 3, 0, 3)
-    summary = run(probe_sweep(seeds=3), store, inline_engine)
-    assert (summary.kept, summary.ran) == (3, 6)
-    assert set(inline_engine.ran.values()) == {1}
-
-
-def test_an_edited_configuration_keeps_the_old_results(store, probe_sweep, inline_engine):
-    run(probe_sweep(trial=ProbeTrial(size=4)), store, inline_engine)
-    before = {path.name: path.read_bytes() for path in store.trials.iterdir()}
-    summary = run(probe_sweep(trial=ProbeTrial(size=5)), store, inline_engine)
-    assert (summary.ran, summary.kept, summary.foreign) == (3, 0, 3)
-    after = {path.name: path.read_bytes() for path in store.trials.iterdir()}
-    assert len(after) == 6
-    assert before.items() <= after.items()
-    assert run(probe_sweep(trial=ProbeTrial(size=4)), store, None).kept == 3
-
-
-def test_a_disk_that_fills_up_stops_the_sweep_and_loses_nothing(store, probe_sweep, inline_engine, monkeypatch):
-    sweep, real, left = probe_sweep(seeds=2), os.fsync, [8]
-
-    def fsync(handle):
-        left[0] -= 1
-        if left[0] < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(handle)
-
-    message = "No space left on device; free some space and give the same command again"
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fsync)
-        with pytest.raises(StoreError, match=message):
-            run(sweep, store, inline_engine)
-    kept = len(list(store.trials.glob("*.json")))
-    assert 0 < kept < 6
-    summary = run(sweep, store, inline_engine)
-    assert (summary.kept, summary.ran, summary.unfinished) == (kept, 6 - kept, 0)
-
-
-def test_processes_that_never_begin_are_not_started_for_ever(store, probe_sweep, monkeypatch):
-    class StubbornEngine:
-        rounds = 0
-
-        def run(self, jobs):
-            self.rounds += 1
-            yield from (Outcome(job.id, "lost") for job in jobs)
-
-        def close(self):
-            pass
-
-    monkeypatch.setattr(driver, "_BUSY_SECONDS", 0)
-    engine = StubbornEngine()
-    assert run(probe_sweep(), store, engine).unfinished == 3
-    assert engine.rounds == 3
 
 
 def test_a_trial_that_hangs_is_ended_and_recorded_as_such(store, probe_sweep):

@@ -11,49 +11,12 @@ import torchreg as tr
 from tests.shapes.kinds import ROBOT, D, at, compare, robot, seeded
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.record import build_shape, record_shape
 
 MOVED = ["hand", "machine", "robot", "rig", "tube"]
 
 
 def crane_chain(text=ROBOT):
     return pk.build_chain_from_urdf(text.encode())
-
-
-def chain_values(shape, pose):
-    """Values of a chain by joint; the one joint that follows another moves with it."""
-    values = dict(zip(shape.dof_names[6:], pose[..., 6:].mT, strict=True))
-    return values | ({"follow": 0.2 - 0.5 * values["hook"]} if "follow" in shape.part_names else {})
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("name", MOVED)
-def test_parts_are_where_pytorch_kinematics_puts_them(shapes, name):
-    shape = build_shape(record_shape(shapes[name]))
-    shape.log_length_scales.copy_(0.2 * seeded(shape.num_parts, seed=2))
-    pose = 0.5 * seeded(4, shape.num_dofs, seed=3)
-    chain, values = shape.chain, chain_values(shape, pose)
-    assert chain.dtype == D
-    assert set(chain.get_joint_parameter_names()) == set(values)
-    found = chain.forward_kinematics(values)
-    base = torch.stack([at(*row[:3], turn=row[3:6]) for row in pose])
-    expected = torch.stack([base @ found[part].get_matrix() for part in shape.part_names], dim=1)
-    compare([shape.part_transforms(pose)], [expected])
-    limits = dict(zip(chain.get_joint_parameter_names(), zip(*chain.get_joint_limits(), strict=True), strict=True))
-    own = zip(shape.lower[6:].tolist(), shape.upper[6:].tolist(), strict=True)
-    assert [limits[joint] for joint in shape.dof_names[6:]] == list(own)
-
-
-@torch.no_grad()
-def test_a_chain_has_the_dtype_of_its_shape_and_does_not_follow_it():
-    hand = tr.Hand()
-    chain = hand.chain
-    before = chain.forward_kinematics(torch.zeros(1, 21))["index_distal"].get_matrix()
-    assert before.dtype == torch.float32
-    hand.log_length_scales += 0.1
-    assert torch.equal(chain.forward_kinematics(torch.zeros(1, 21))["index_distal"].get_matrix(), before)
-    longer = hand.chain.forward_kinematics(torch.zeros(1, 21))["index_distal"].get_matrix()
-    torch.testing.assert_close(longer[0, :3, 3], math.exp(0.1) * before[0, :3, 3])
 
 
 def test_names_that_pytorch_kinematics_would_confuse_stay_apart():
@@ -108,14 +71,6 @@ def test_mimic_joints_are_joints_of_their_own(tmp_path):
     compare([shape.part_transforms(pose)[3]], [found["hook"].get_matrix()[0]])
 
 
-def test_a_serial_chain_starts_at_its_root():
-    serial = pk.SerialChain(crane_chain(), "boom", "mast")
-    shape = tr.ArticulatedShape.from_chain(serial, dtype=D)
-    assert shape.dof_names[6:] == ("tilt",)
-    expected = serial.forward_kinematics(torch.tensor([0.3]), end_only=True).get_matrix()[0].double()
-    compare([shape.part_transforms(torch.tensor([0.0] * 6 + [0.3], dtype=D))[-1]], [expected], atol=1e-6)
-
-
 def frame(name, translation, joint_type="revolute", visuals=(), **options):
     offset = pk.Transform3d(pos=torch.tensor(translation, dtype=D), dtype=D)
     link = pk.Link(name, visuals=visuals)
@@ -164,13 +119,6 @@ def test_frames_get_a_bone_to_each_frame_on_them_unless_the_geometry_is_given():
     assert shape.primitives.part_kinds[1] == "capsule"
     known = tr.ArticulatedShape.from_chain(bare_leg([Visual(None, "sphere", 0.1)]), dtype=D)
     assert known.part_names == ("knee",)
-
-
-def test_a_shape_of_a_chain_aligns():
-    shape = tr.ArticulatedShape.from_chain(crane_chain(), free_base=False).requires_grad_(False)
-    truth = torch.tensor([0.0] * 6 + [0.4, -0.3, 0.1])
-    result = tr.align(shape, tr.sample_skin(shape, 300)(truth), shape.rest_pose())
-    torch.testing.assert_close(result.pose, truth, atol=0.02, rtol=0)
 
 
 def nan_axis(boom):

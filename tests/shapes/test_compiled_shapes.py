@@ -81,19 +81,6 @@ def test_layers_are_compiled_as_one_graph_and_exported_for_inputs_of_any_size(
         assert_same(program(inputs[:count]), layer(inputs[:count]))
 
 
-@new_torch
-def test_the_forward_pass_of_a_shape_is_compiled_as_one_graph_and_trained(poses):
-    hand = tr.Hand().requires_grad_(True)
-    outputs, gradients = [], []
-    for layer in (compiled(hand), hand):
-        hand.zero_grad()
-        outputs.append(layer(poses))
-        outputs[-1].points.square().sum().backward()
-        gradients.append([value.grad.clone() for value in hand.parameters()])
-    assert_same(*outputs)
-    torch.testing.assert_close(*gradients)
-
-
 def test_the_forward_pass_of_a_shape_is_mapped_and_differentiated(plain_hand, poses):
     # A tenth of the samples: a reverse pass for each coordinate of each takes long.
     plain_hand = copy.deepcopy(plain_hand)
@@ -111,12 +98,3 @@ def test_the_forward_pass_of_a_shape_is_mapped_and_differentiated(plain_hand, po
     for row, pose in enumerate(poses):
         own = functional_call(plain_hand, {name: value[row] for name, value in states.items()}, (pose,))
         assert_same(tuple(field[row] for field in mapped), own)
-
-
-def test_mapped_layers_are_batched_layers(plain_hand, plain_hand_skin, points, poses):
-    torch.testing.assert_close(vmap(plain_hand_skin)(poses), plain_hand_skin(poses))
-    mapped = vmap(plain_hand.distance, in_dims=(None, 0))(points, poses)
-    torch.testing.assert_close(mapped, torch.stack([plain_hand.distance(points, pose) for pose in poses]))
-    model = grid_model(points, "linear")
-    many = model.transforms.detach() + torch.arange(3.0)[:, None, None, None] * torch.eye(4)[:, 3:]
-    torch.testing.assert_close(vmap(model, in_dims=(None, 0))(points, many), model(points, many))

@@ -108,22 +108,6 @@ def test_jacobian_matches_differences(two_balls, ball_skin):
     compare(surface.distance_jacobian(points, pose), (surface.distance(points, pose), slope), atol=2e-8)
 
 
-@torch.no_grad()
-def test_batches_are_loops_and_distances_move_with_the_base(two_balls, ball_skin):
-    surface = SkinSurface(ball_skin)
-    poses = torch.stack([random_pose(two_balls, seed) for seed in range(3)])
-    points = torch.stack([around_balls(two_balls, pose, 40) for pose in poses])
-    many = surface.distance_jacobian(points, poses)
-    for row in range(3):
-        compare((part[row] for part in many), surface.distance_jacobian(points[row], poses[row]))
-    compare([surface.distance(points[:1], poses)[2]], [surface.distance(points[0], poses[2])])
-    grid = surface.distance(points.unsqueeze(1), torch.stack([poses, poses.flip(0)], dim=1))
-    compare([grid[0, 1]], [surface.distance(points[0], poses[2])])
-    step = torch.tensor([0.1, -0.3, 0.2, 0.5, -1.0, 2.0, 0.0], dtype=D)
-    moved = (points[0] - poses[0, :3]) @ at(turn=step[3:6])[:3, :3].mT + poses[0, :3] + step[:3]
-    compare([surface.distance(moved, two_balls.retract(poses[0], step))], [many[0][0]])
-
-
 def test_of_copies_of_a_point_the_first_one_counts(two_balls, ball_skin):
     """A copy that rides on another part is a point of its own."""
     order = torch.cat([torch.arange(3000), torch.randperm(3000, generator=torch.Generator().manual_seed(5))])

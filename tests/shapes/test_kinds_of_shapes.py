@@ -77,27 +77,6 @@ def test_jacobians_in_tangent_steps_equal_differences_through_the_retraction(sha
 
 
 @torch.no_grad()
-def test_batches_equal_single_problems(shape):
-    poses = poses_of(shape, 4).unflatten(0, (2, 2))
-    points = around(shape, poses, 12)
-    many = shape.distance_jacobian(points, poses, chart="tangent")
-    shared = shape.distance(points[0, 0], poses)
-    rows, posed = shape.transform_jacobian(poses), shape(poses)
-    assert posed.points.shape[:2] == (2, 2)
-    for i in range(4):
-        index = divmod(i, 2)
-        pose = poses[index]
-        compare((part[index] for part in many), shape.distance_jacobian(points[index], pose, chart="tangent"))
-        compare((part[index] for part in rows), shape.transform_jacobian(pose))
-        compare((part[index] for part in posed), shape(pose))
-        compare([shared[index]], [shape.distance(points[0, 0], pose)])
-    assert torch.equal(posed.keypoints, shape.keypoints(poses))
-    assert torch.equal(posed.transforms, shape.part_transforms(poses))
-    if posed.keypoints.shape[-2] == shape.num_parts:
-        assert torch.equal(posed.keypoints, posed.transforms[..., :3, 3])
-
-
-@torch.no_grad()
 def test_all_moves_with_the_base(shape):
     pose = poses_of(shape, 1, seed=2)[0]
     points, motion = around(shape, pose), Rotation.from_rotvec([0.7, -1.9, 0.4])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.shapes.kinds import D, at, compare
+from tests.shapes.kinds import D, at
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes import link_surface
 from torchreg.shapes.primitives import Primitive
@@ -85,20 +85,6 @@ def test_jacobian_matches_differences(arm):
     # Where a step changes the nearest sample, the difference means nothing.
     same = (found - jacobian).abs().amax(-1) < 1e-5
     assert float(same.double().mean()) > 0.9
-
-
-def test_batches_are_loops_and_the_surface_moves_with_the_base(arm):
-    surface = link_surface.LinkSurface(arm)
-    poses = torch.stack([POSE, POSE.flip(0), torch.zeros(7, dtype=D)])
-    points = torch.stack([around(arm, pose, 50) for pose in poses])
-    distance, jacobian = surface.distance_jacobian(points, poses)
-    for row in range(3):
-        compare((distance[row], jacobian[row]), surface.distance_jacobian(points[row], poses[row]))
-    grid = surface.distance(points.unsqueeze(1), torch.stack([poses, poses.flip(0)], dim=1))
-    torch.testing.assert_close(grid[0, 1], surface.distance(points[0], poses[2]))
-    single = link_surface.LinkSurface(two_boxes().float()).distance(points.float(), poses.float())
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), distance, rtol=0, atol=1e-3)
 
 
 def test_meshes_turned_inside_out_are_turned_back_and_open_ones_have_no_inside(arm):

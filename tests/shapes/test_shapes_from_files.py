@@ -2,9 +2,7 @@
 
 import copy
 import math
-import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +14,8 @@ import torchreg as tr
 from tests.shapes.kinds import D, at, robot, tube
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.shapes import rigs
-from torchreg.shapes.primitive_refinement import refine_primitives
-from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.record import build_shape, record_shape
 
-HAND = Path(__file__).resolve().parents[3] / "shared" / "data" / "webxr_hand_right.glb"
-needs_hand = pytest.mark.skipif(not HAND.exists(), reason="the measuring data is not beside the repository")
 NAMES = ("shoulder", "elbow", "wrist", "end")
 
 
@@ -110,67 +104,6 @@ def test_solids_lie_near_the_mesh_and_their_length_is_along_the_bone(kind):
         assert bool((shape.primitives.rotations[:, 2, 2].abs() > 0.8).all())
 
 
-@torch.no_grad()
-@needs_hand
-def test_a_public_hand_with_a_flat_hierarchy():
-    parents = {"wrist": None}
-    for finger in ("thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"):
-        middle = () if finger == "thumb" else ("phalanx-intermediate",)
-        above = "wrist"
-        for bone in ("metacarpal", "phalanx-proximal", *middle, "phalanx-distal", "tip"):
-            parents[f"{finger}-{bone}"] = above
-            above = f"{finger}-{bone}"
-    message = r"25 roots .*it is disconnected; for a flat hierarchy name each joint's parent"
-    with pytest.raises(tr.errors.ModelError, match=message):
-        tr.ArticulatedShape.from_gltf(HAND)
-    shape = tr.ArticulatedShape.from_gltf(HAND, parents=parents, dtype=D)
-    assert shape.num_parts == 20
-    assert not any("tip" in name for name in (*shape.part_names, *shape.dof_names))
-    rest, vertices = shape.rest_pose(), shape.surface.vertices
-    skin = shape.file_skin()
-    torch.testing.assert_close(skin(rest), vertices, atol=1e-12, rtol=0)
-    error = shape.distance(vertices, rest).abs()
-    assert float(error.mean()) < 0.0006
-    assert float(error.quantile(0.95)) < 0.002
-    pose = rest.clone()
-    for index, name in enumerate(shape.dof_names):
-        if "phalanx" in name and name.endswith("_x"):
-            pose[index] = -math.radians(30)
-    truth = skin(pose)
-    assert float((truth - vertices).norm(dim=-1).mean()) > 0.01
-    bent = (tr.BendingSkin(shape, vertices, rest)(pose) - truth).norm(dim=-1)
-    assert float(bent.mean()) < 0.0005
-    assert float(bent.quantile(0.95)) < 0.002
-
-
-@torch.no_grad()
-def test_refining_recovers_solids_from_points_on_their_fused_surface():
-    spec = rigs.spec_from_arrays(*tube(), [-1, 0, 1, 2])
-    truth = tr.ArticulatedShape.from_spec(spec, dtype=D)
-    mesh = truth.surface_mesh(spacing=0.008)
-    owners = truth.part_distances(mesh.vertices, truth.rest_pose()).argmin(-1)
-    transforms = truth.part_transforms(truth.rest_pose())
-    shaken = []
-    for part, solid in enumerate(spec.primitives):
-        pose = transforms[part] @ solid.pose
-        pose[:3, 3] += 0.003
-        shaken.append(Primitive(solid.kind, tuple(size * 1.1 for size in solid.sizes), pose))
-
-    def error(solids):
-        moved = [
-            Primitive(s.kind, s.sizes, torch.linalg.inv(transforms[part]) @ s.pose) for part, s in enumerate(solids)
-        ]
-        shape = tr.ArticulatedShape(spec.tree, spec.part_frames, moved, nu=spec.nu, dtype=D)
-        return float(shape.distance(mesh.vertices, shape.rest_pose()).abs().mean())
-
-    refined = refine_primitives(shaken, truth.adjacency, spec.nu, mesh.vertices, owners)
-    assert error(shaken) > 0.002
-    assert error(refined) < 0.0003
-    kept = refine_primitives(shaken, truth.adjacency, spec.nu, mesh.vertices, owners, max_steps=0)
-    torch.testing.assert_close(kept[1].pose, shaken[1].pose)
-    assert kept[1].sizes == pytest.approx(shaken[1].sizes)
-
-
 class Layer(nn.Module):
     """The distance of points from a shape, as a layer."""
 
@@ -182,33 +115,10 @@ class Layer(nn.Module):
         return self.shape.distance(points, self.shape.rest_pose())
 
 
-def in_inference_first(shape):
-    with torch.inference_mode():
-        Layer(shape)(tube()[0])
-    return Layer(shape)
-
-
-def of_a_loaded_state(shape):
-    other = arm()
-    other.load_state_dict(shape.state_dict())
-    return Layer(other)
-
-
-def functional(shape):
-    layer = Layer(shape)
-    return lambda points: torch.func.functional_call(layer, dict(layer.named_buffers()), points)
-
-
 WAYS = {
     "as it is": Layer,
     "a copy": lambda shape: Layer(copy.deepcopy(shape)),
-    "pickled": lambda shape: Layer(pickle.loads(pickle.dumps(shape))),
-    "in another precision first": lambda shape: Layer(shape.float().double()),
-    "in inference first": in_inference_first,
     "under a transform": lambda shape: lambda points: torch.func.vmap(Layer(shape))(points.unsqueeze(0))[0],
-    "one graph": lambda shape: torch.compile(Layer(shape), fullgraph=True, backend="aot_eager"),
-    "a functional call": functional,
-    "a state": of_a_loaded_state,
     "a record": lambda shape: Layer(build_shape(record_shape(shape))),
 }
 

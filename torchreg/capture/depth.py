@@ -150,9 +150,8 @@ def plane_normals(
 ) -> Tensor:
     """Return the normals (..., H, W, 3) of the planes that fit windows of depth images, towards the camera.
 
-    On a plane ``n . X = d`` the inverse depth ``1 / z`` is ``n . (x, y, 1) / d``, linear in the picture: the fit is
-    exact. Only neighbors within three standard deviations of the noise and the steepest slope count; zero below three
-    pixels.
+    On a plane ``n . X = d`` the inverse depth ``1 / z`` is ``n . (x, y, 1) / d``, linear in the picture. Only neighbors
+    within three standard deviations of the noise and the steepest slope count; zero below three pixels.
     """
     fx, fy, cx, cy = intrinsics
     with torch.no_grad():

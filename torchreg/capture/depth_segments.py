@@ -182,10 +182,7 @@ def beyond_cut(frame: DepthFrame, off: Tensor) -> Tensor:
 
 
 def open_rim(frame: DepthFrame, lies_on: Callable[[Tensor], Tensor]) -> float:
-    """Return the share of the rim of what lies on a shape along which the measured surface goes on, from 0 to 1.
-
-    ``lies_on``: which of points (M, 3), in world coordinates, lie on the shape, (M,) bool.
-    """
+    """Return the share of the rim of what ``lies_on`` says of points (M, 3) along which the surface goes on, 0 to 1."""
     stride, surface = frame.stride, frame.without_mask.measured
     depth = (frame.depth * surface)[::stride, ::stride]
     pixels = depth.nonzero()

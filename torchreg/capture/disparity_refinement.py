@@ -41,13 +41,9 @@ class RefinedDisparity:
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """The K pixels around each of N pixels, all numbers float64.
+    """The K pixels around each of N pixels, with Gaussian weights, zero on other surfaces; float64.
 
-    Args:
-        column, row: (N, K) int64, within the picture.
-        basis: (K, 3) of a plane in the window: one, the step along the row, the step down.
-        disparity: (N, K) dense disparity, NaN where it is not known.
-        weights: (N, K) Gaussian in the picture, zero on other surfaces.
+    ``basis`` (K, 3): one, the step along the row, the step down.
     """
 
     column: Tensor

@@ -20,28 +20,17 @@ class FreeSpace:
     A point at depth z whose pixel has a surface at depth D intrudes by ``D - z`` if that is positive; outside of the
     mask by the smaller of that and ``z / f`` times its distance from the mask in pixels. Nothing is known behind the
     surface, without a measurement within the mask, outside of the picture and behind the camera.
-
-    Args:
-        depth: (F, H, W) metres, zero where nothing was measured.
-        beside: (F, H, W) distance from the mask, pixels, zero inside.
-        extent: (F, 2) width and height of the pictures, pixels; smaller ones are padded.
-        intrinsics: (F, 4) fx, fy, cx, cy, pixels.
-        world_to_camera: (F, 4, 4) rigid motions.
-        lens: (F, 8) see `Camera`.
-        picture: (B,) int64 number of each problem's picture.
-        origin: (B, 3) of each problem's coordinates, in the world, metres.
-        datum_area: (B,) area that a datum stands for at a depth of one metre, square metres.
     """
 
-    depth: Tensor
-    beside: Tensor
-    extent: Tensor
-    intrinsics: Tensor
-    world_to_camera: Tensor
-    lens: Tensor
-    picture: Tensor
-    origin: Tensor
-    datum_area: Tensor
+    depth: Tensor  # (F, H, W) metres, zero where nothing was measured
+    beside: Tensor  # (F, H, W) distance from the mask, pixels, zero inside
+    extent: Tensor  # (F, 2) width and height of the pictures, pixels; smaller ones are padded
+    intrinsics: Tensor  # (F, 4) fx, fy, cx, cy, pixels
+    world_to_camera: Tensor  # (F, 4, 4) rigid motions
+    lens: Tensor  # (F, 8) see `Camera`
+    picture: Tensor  # (B,) int64 number of each problem's picture
+    origin: Tensor  # (B, 3) of each problem's coordinates, in the world, metres
+    datum_area: Tensor  # (B,) area that a datum stands for at a depth of one metre, square metres
 
     @classmethod
     def of_picture(cls, depth: Tensor, camera: Camera, mask: Tensor | None, stride: int) -> FreeSpace:
@@ -189,14 +178,9 @@ class FreeSpace:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What pictures show at points, (B, N): distance from the mask (pixels), depth and side margins (metres).
+    """What pictures show at points, (B, N): distance from the mask (pixels) and its slope, margins (metres).
 
-    Args:
-        plane: (B, N, 2) the points on the plane at depth one.
-        slope: (B, N, 2) of the distance.
-        ahead: how far before the measured surface.
-        sideways: how far outside of the mask; infinite inside.
-        counts: whether the point is in free space.
+    ``ahead`` of the measured surface, ``sideways`` outside of the mask, infinite inside; ``counts`` in free space.
     """
 
     plane: Tensor

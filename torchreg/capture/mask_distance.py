@@ -9,10 +9,9 @@ from torchreg.geometry.distance_transform import distance_beside, signed_distanc
 
 
 def signed_mask_distance(mask: Tensor) -> Tensor:
-    """Return the signed distance (H, W) of every pixel's middle to a mask's outline, negative inside, pixels.
+    """Return the signed distance (H, W) of pixels to a mask's outline, negative inside, float32 on the CPU.
 
-    The outline runs half a pixel outside of the middles inside; half the diagonal without an outline. Float32 on the
-    CPU.
+    The outline runs half a pixel outside of the middles inside; half the diagonal without an outline.
     """
     far = _far(mask)
     return signed_distance(mask.cpu(), torch.float32).nan_to_num(posinf=far, neginf=-far)

@@ -40,18 +40,11 @@ _CARVING = _Carving()
 
 @dataclass(frozen=True, eq=False)
 class VisualHull:
-    """The largest body with given silhouettes, as a signed distance field on a grid.
+    """The largest body with given silhouettes, as a signed distance field on a grid."""
 
-    Args:
-        field: (X, Y, Z) largest signed distance to the masks' outlines, times the size of a pixel at that depth:
-            negative inside, in the unit of the cameras. Far from the surface only its sign is meaningful.
-        origin: (3,) of sample (0, 0, 0).
-        spacing: between samples.
-    """
-
-    field: Tensor
-    origin: Tensor
-    spacing: float
+    field: Tensor  # (X, Y, Z) largest distance to the outlines, negative inside; far off only its sign counts
+    origin: Tensor  # (3,) of sample (0, 0, 0), in the unit of the cameras
+    spacing: float  # between samples
 
     def mesh(self) -> TriangleMesh:
         """Return the watertight surface, oriented outwards."""
@@ -65,11 +58,7 @@ class VisualHull:
 
 
 def visual_hull(
-    masks: Sequence[Tensor],
-    cameras: CameraRig | Sequence[Camera],
-    *,
-    resolution: int = 256,
-    box: Tensor | None = None,
+    masks: Sequence[Tensor], cameras: CameraRig | Sequence[Camera], *, resolution: int = 256, box: Tensor | None = None
 ) -> VisualHull:
     """Return the visual hull of calibrated silhouettes: all points that every camera sees inside its mask.
 

@@ -44,25 +44,15 @@ _ORDER = _OrderCheck()
 
 @dataclass(frozen=True, eq=False)
 class StereoPoints:
-    """Corners that both cameras of a pair see.
+    """Corners that both cameras of a pair see."""
 
-    Args:
-        points: (N, 3) in world coordinates, metres.
-        depth_std: (N,) standard deviation of the depth before the left camera, metres.
-        covariance: (N, 3, 3) of the points, along the rays of the left camera and, by a tenth of a pixel, across.
-        pixels: (N, 2) in the left picture, as (column, row).
-        disparity: (N,) pixels.
-        disparity_std: (N,) pixels.
-        dense: (H, W) disparity of all pixels, NaN where it is not known.
-    """
-
-    points: Tensor
-    depth_std: Tensor
-    covariance: Tensor
-    pixels: Tensor
-    disparity: Tensor
-    disparity_std: Tensor
-    dense: Tensor
+    points: Tensor  # (N, 3) in world coordinates, metres
+    depth_std: Tensor  # (N,) standard deviation of the depth before the left camera, metres
+    covariance: Tensor  # (N, 3, 3) of the points, along the rays of the left camera and, by a tenth of a pixel, across
+    pixels: Tensor  # (N, 2) in the left picture, as (column, row)
+    disparity: Tensor  # (N,) pixels
+    disparity_std: Tensor  # (N,) pixels
+    dense: Tensor  # (H, W) disparity of all pixels, NaN where it is not known
 
     def __len__(self) -> int:
         return len(self.points)

@@ -55,11 +55,7 @@ _VARIETY = _Variety()
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch:
-    """Clouds (B, M, 3) of one shape about the origin, metres; the mask (B, M) is False for padding; and the truth.
-
-    Args:
-        index: (B, M) int64 observed point of the skin, -1 for outliers.
-    """
+    """Clouds (B, M, 3) about the origin with a mask (B, M), and the truth: the point of the skin, -1 for outliers."""
 
     points: Tensor
     mask: Tensor
@@ -70,8 +66,7 @@ class CloudBatch:
 def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator) -> Tensor:
     """Return poses (count, num_dofs) within the joint limits, turned at random, their middle at the origin.
 
-    Fingers of a hand curl together in half of the poses; all other joints move independently, each pose by up to a
-    share of their ranges of its own.
+    Fingers curl together in half of a hand's poses; all other joints move independently, each pose by its own share.
     """
     check_count(count, "count", 1)
     if not bool(torch.isinf(shape.lower[:3]).all()):
@@ -102,10 +97,9 @@ def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator
 def random_clouds(
     skin: LinearBlendSkin, size: float, poses: Tensor, num_points: int, generator: torch.Generator
 ) -> CloudBatch:
-    """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, thinned or not.
+    """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, of a size in metres.
 
-    The object's proportions differ a little from the shape's (size in metres); some hands have a forearm, and some
-    clouds a second object.
+    Proportions differ a little from the shape's; some hands have a forearm, and some clouds a second object.
     """
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)

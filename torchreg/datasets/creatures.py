@@ -34,21 +34,14 @@ _MOTION = _ArmMotion()
 
 @dataclass(frozen=True)
 class CreatureForm:
-    """The form of a creature and the amplitudes of its motion; lengths in shares of an arm's.
-
-    Args:
-        root: radius of an arm at the body.
-        end: radius of an arm at its tip.
-        sway: largest turn of an arm's end in the plane of the body, radians; all arms sway together by half of it.
-        curl: largest turn of an arm's end out of that plane, radians.
-    """
+    """The form of a creature and the amplitudes of its motion; lengths in shares of an arm's."""
 
     num_arms: int
     body: float
-    root: float
-    end: float
-    sway: float
-    curl: float
+    root: float  # radius of an arm at the body
+    end: float  # radius of an arm at its tip
+    sway: float  # largest turn of an arm's end in the plane of the body, radians; all arms sway together by half of it
+    curl: float  # largest turn of an arm's end out of that plane, radians
 
     def __post_init__(self) -> None:
         check_count(self.num_arms, "num_arms", 3)
@@ -64,22 +57,14 @@ OCTOPUS = CreatureForm(num_arms=8, body=0.3, root=0.1, end=0.05, sway=0.4, curl=
 
 @dataclass(frozen=True, eq=False)
 class CreatureSequence:
-    """A creature in T frames whose meshes are unrelated, and the truth; the length of an arm is about 1.
-
-    Args:
-        tips: (T, K, 3) ends of the arms, on the surface.
-        curves: (T, K, S, 3) axes of the arms, from the middle of the body to the middle of the last ball.
-        radii: (K, S) of the arms around their axes.
-        touching: (T,) bool, True where arms 0 and 1 are merged.
-        topology: of the tree of arms in the form of `Skeleton.topology`.
-    """
+    """A creature in T frames whose meshes are unrelated, and the truth; the length of an arm is about 1."""
 
     meshes: tuple[TriangleMesh, ...]
-    tips: Tensor
-    curves: Tensor
-    radii: Tensor
-    touching: Tensor
-    topology: str
+    tips: Tensor  # (T, K, 3) ends of the arms, on the surface
+    curves: Tensor  # (T, K, S, 3) axes of the arms, from the middle of the body to the middle of the last ball
+    radii: Tensor  # (K, S) of the arms around their axes
+    touching: Tensor  # (T,) bool, True where arms 0 and 1 are merged
+    topology: str  # of the tree of arms in the form of `Skeleton.topology`
 
 
 def creature_sequence(

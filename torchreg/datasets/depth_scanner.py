@@ -30,21 +30,13 @@ class SurfaceScan:
 
 @dataclass(frozen=True)
 class DepthScanner:
-    """A depth camera at the origin that looks along +z with -y up.
+    """A depth camera at the origin that looks along +z with -y up."""
 
-    Args:
-        num_points: approximate number of points of the first frame, which determines the size of the pixels.
-        noise: standard deviation of a depth z as a multiple of z^2, 1/m: 2e-4 is 1.8 mm at 3 m, a good stereo camera.
-        max_slant: no depth is measured where the ray meets the surface at more than this from its normal, radians.
-        num_holes: round patches without data at random positions on the surface.
-        hole_radius: of those, as a share of the diagonal of the mesh.
-    """
-
-    num_points: int = 4500
-    noise: float = 2e-4
-    max_slant: float = math.radians(80)
-    num_holes: int = 2
-    hole_radius: float = 0.02
+    num_points: int = 4500  # approximate number of points of the first frame, which determines the size of the pixels
+    noise: float = 2e-4  # standard deviation of a depth z over z^2, 1/m: 2e-4 is 1.8 mm at 3 m, a good stereo camera
+    max_slant: float = math.radians(80)  # of a ray to the normal of a surface that is measured, radians
+    num_holes: int = 2  # round patches without data at random positions on the surface
+    hole_radius: float = 0.02  # of those, as a share of the diagonal of the mesh
 
     def __post_init__(self) -> None:
         check_count(self.num_points, "num_points", 3)

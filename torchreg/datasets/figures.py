@@ -19,11 +19,7 @@ SIDES = {"left": 1.0, "right": -1.0}  # signs of x
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a body in its rest pose, in the body's coordinates: metres, y up and z forward.
-
-    Args:
-        joint: position of the joint with the parent; for the root its own middle.
-    """
+    """One part of a body at rest: metres, y up and z forward; the root's joint is its own middle."""
 
     name: str
     parent: str | None
@@ -33,12 +29,9 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A surface in its rest pose and its parts, which move it by linear blend skinning; metres, y up and z forward.
+    """A surface at rest and its P parts, which move it by linear blend skinning with weights (V, P).
 
-    Args:
-        weights: (V, P) rows sum to one.
-        joints: (P, 3) joints of the parts with their parents, in the rest pose; for the root its own middle.
-        parents: P indices, parents before children, -1 for the root.
+    Parents come before children, -1 for the root; metres, y up and z forward.
     """
 
     mesh: TriangleMesh

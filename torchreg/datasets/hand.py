@@ -53,13 +53,9 @@ _STAGE, _PERIODS = _Stage(), _Periods()
 
 @dataclass(frozen=True, eq=False)
 class HandCloud:
-    """A measured cloud in random order and the truth behind it.
+    """A measured cloud (M, 3) in random order and the truth behind it; parts are -1 for outliers.
 
-    Args:
-        inliers: (M,) bool, True for points of the shape.
-        part_labels: (M,) int64 part of each point, -1 for outliers.
-        vertices: (V, 3) true positions of the vertices of the skin that was measured, metres.
-        part_counts: (P,) int64 points on each part.
+    ``vertices`` (V, 3) are the true positions of those of the skin, ``part_counts`` (P,) the points on each part.
     """
 
     points: Tensor
@@ -107,25 +103,11 @@ def make_hand_cloud(
     skin: LinearBlendSkin | None = None,
     generator: torch.Generator | None = None,
 ) -> HandCloud:
-    """Return a noisy cloud of a shape in a pose, with outliers, as a range camera would deliver it.
+    """Return a noisy cloud of a shape in a pose (num_dofs,), with outliers, as a range camera would deliver it.
 
-    Args:
-        shape: the true shape.
-        pose: (num_dofs,) the true pose.
-        num_points: number of points on the surface.
-        noise: standard deviation of each coordinate, metres.
-        outlier_ratio: outliers as a share of all points, at least 0 and below 1; they lie uniformly in the bounding box
-            of the posed surface grown by 5 cm on each side.
-        camera: (3,) position of a camera; points then lie on the side it sees, uniformly over its picture. None: on
-            all sides, uniformly by area.
-        skin: of the true surface, with faces; by default `surface_skin`, which is made anew at every call.
-        generator: source of randomness; None draws from a fresh generator with seed 0, the same cloud at every call.
-
-    Returns:
-        The cloud, in the shape's dtype and on its device.
-
-    Raises:
-        InputError: if an argument is out of range or the skin has no faces.
+    A camera at (3,) sees the side towards it, uniformly over its picture; None: all sides, uniformly by area.
+    ``outlier_ratio`` is the share of all points that lie uniformly in the posed surface's box, grown by 5 cm; ``noise``
+    is the standard deviation of each coordinate, metres. Without a generator it is the same cloud at every call.
     """
     check_count(num_points, "num_points", 1)
     check_positive(noise, "noise", allow_zero=True)
@@ -186,21 +168,10 @@ def random_hand_pose(
 ) -> Tensor:
     """Return a random pose within the joint limits, turned at random, before a camera at the origin looking along +z.
 
-    All joints of a finger curl together, and fingers spread apart, so that they do not run through each other; the
-    joints of other shapes move independently around the rest pose.
-
-    Args:
-        hand: the shape.
-        generator: source of randomness; None draws from a fresh generator with seed 0, the same pose at every call.
-        bend: share of the way to their limits that joints move at most, 0 to 1.
-        distance: from the origin to the middle of the shape, metres, up to 3 cm to each side; for a unit of your own,
-            choose a few times the size of the shape.
-
-    Returns:
-        The pose (num_dofs,), metres and radians; a base that cannot move stays in place.
-
-    Raises:
-        InputError: if ``bend`` is not between 0 and 1 or ``distance`` not positive.
+    All joints of a finger curl together, and fingers spread apart, so that they do not run through each other; joints
+    of other shapes move independently around the rest pose, by up to a share ``bend`` of the way to their limits.
+    ``distance`` is from the origin to the middle of the shape, metres, up to 3 cm to each side; for a unit of your own,
+    choose a few times the size of the shape. Without a generator it is the same pose at every call.
     """
     _check_share(bend, "bend")
     check_positive(distance, "distance")
@@ -242,7 +213,7 @@ def hand_motion(
     distance: float = _STAGE.distance,
     seed: int = 0,
 ) -> Tensor:
-    """Return the poses of a smooth motion before a camera at the origin that looks along +z with -y up.
+    """Return the poses (num_frames, num_dofs) of a smooth motion before a camera at the origin along +z with -y up.
 
     In all of them the hand sways a little, upright with the palm to the camera unless said otherwise:
 
@@ -252,28 +223,13 @@ def hand_motion(
       the picture and at most 25 degrees from upright;
     - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together,
       with the palm or the back to the camera;
-    - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface visible before is hidden;
-      4 s later it turns back;
+    - "flip": within a second, about 2 s after the start, it turns by 180 degrees; 4 s later it turns back;
     - "fast": as "bending_palm", swaying more, 3 to 4 times as fast;
     - "occlusion": in 1.5 s, about 2 s after the start, it passes through the middle of the picture from one side to
       the other, in `hand_sequence` behind a bar; 4 s later it returns.
 
-    Args:
-        shape: a hand, or any articulated shape.
-        kind: one of the above.
-        num_frames: number of frames.
-        fps: frames per second.
-        bend: share of the way to their limits that joints move at most, 0 to 1.
-        distance: from the origin to the middle of the shape, metres.
-        seed: of depths and phases of the bends, and of axes, amplitudes, speeds and times.
-
-    Returns:
-        Poses (num_frames, num_dofs), metres and radians; the rotation vectors have angles of at most pi.
-
-    Raises:
-        InputError: if an argument is out of range.
-
-    References: Dewaele et al. 2006, section 5 ("rotation", "bending_palm", "bending_back", "flip").
+    ``bend`` is the share of the way to their limits that joints move at most, ``distance`` that of the middle of the
+    shape, metres. Dewaele et al. 2006, section 5.
     """
     check_choice(kind, "kind", MOTIONS)
     check_count(num_frames, "num_frames", 1)
@@ -381,8 +337,7 @@ def _curl_groups(shape: ArticulatedShape) -> Tensor:
 def curled_joints(hand: Hand, own: Tensor, finger: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
     """Return joint angles (..., 21) of a hand whose fingers curl, and spread so that they do not meet.
 
-    Draws are (..., 21): of each joint and of each finger from 0 to 1, of the abductions from -1 to 1. ``bend`` is the
-    share of the range that joints move at most, (..., 1) or one for all.
+    Draws are (..., 21): of joints and fingers from 0 to 1, of abductions from -1 to 1; ``bend`` is a share.
     """
     # One draw per finger, and a little of one per joint.
     return _hand_joints(hand, bend * (0.8 * finger[..., _curl_groups(hand)] + 0.2 * own), spread, bend)

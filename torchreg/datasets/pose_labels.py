@@ -20,12 +20,7 @@ _KIND, _STEM = "PoseLabel", "label_"
 
 @dataclass(frozen=True)
 class PoseLabel:
-    """One cloud and its pose, metres and radians.
-
-    Args:
-        parts: (M,) int64, the part of the shape that each point lies on, -1 for points off the surface.
-        confidence: () from 0 to 1.
-    """
+    """One cloud and its pose, metres and radians; parts (M,) are -1 off the surface, the confidence () 0 to 1."""
 
     points: Tensor
     pose: Tensor

@@ -35,30 +35,20 @@ _CAMERA = _CameraSetup()
 
 @dataclass(frozen=True, eq=False)
 class ScanPair:
-    """Two range scans of a figure in two poses, and the truth.
-
-    Args:
-        truth: (N, 3) true positions of the source's points in the target's pose, noiseless, visible or not.
-        labels: (N,) int64 true part of each source point.
-        joints: (J, 3) true joints in the source's pose, of each part but the root with its parent.
-        joint_parts: (J, 2) parts that meet at each joint, the parent first.
-        transforms: (P, 4, 4) true motions of the parts from source to target.
-        visible: (N,) bool, True where the target's camera sees the true position.
-        missing: (N,) bool, True on parts that were taken off before the target was scanned.
-    """
+    """Two range scans of a figure in two poses, and the truth."""
 
     source: RangeScan
     target: RangeScan
-    truth: Tensor
-    labels: Tensor
+    truth: Tensor  # (N, 3) true positions of the source's points in the target's pose, noiseless, visible or not
+    labels: Tensor  # (N,) int64 true part of each source point
     target_labels: Tensor
-    joints: Tensor
+    joints: Tensor  # (J, 3) true joints in the source's pose, of each part but the root with its parent
     target_joints: Tensor
-    joint_parts: Tensor
-    transforms: Tensor
+    joint_parts: Tensor  # (J, 2) parts that meet at each joint, the parent first
+    transforms: Tensor  # (P, 4, 4) true motions of the parts from source to target
     part_names: tuple[str, ...]
-    visible: Tensor
-    missing: Tensor
+    visible: Tensor  # (N,) bool, True where the target's camera sees the true position
+    missing: Tensor  # (N,) bool, True on parts that were taken off before the target was scanned
 
     def error(self, deformed: Tensor) -> Tensor:
         """Return distances (N,) of moved source points (N, 3) from the truth, as shares of the source's diagonal."""
@@ -70,16 +60,12 @@ class ScanSequence(Sequence[RangeScan]):
     """Frames of a moving figure, each scanned from one side on request, always with the same result.
 
     ``sequence[t]`` is a `RangeScan` and ``sequence.pair(s, t)`` a `ScanPair`.
-
-    Args:
-        transforms: (T, P, 4, 4) float64 motions of the parts from the rest pose to before the camera.
-        missing: per frame the number of a part that was taken off, -1 for none; empty where none ever is.
     """
 
     figure: Figure
-    transforms: Tensor
+    transforms: Tensor  # (T, P, 4, 4) float64 motions of the parts from the rest pose to before the camera
     scanner: DepthScanner = field(default_factory=DepthScanner)
-    missing: tuple[int, ...] = ()
+    missing: tuple[int, ...] = ()  # the part that was taken off in each frame, -1 for none; empty where none ever is
     seed: int = 0
     dtype: torch.dtype = torch.float32
 

@@ -49,24 +49,9 @@ def hand_sequence(
 ) -> list[HandCloud]:
     """Return the clouds of a moving hand, frame by frame, as a pair of cameras measures it, with the exact truth.
 
-    Args:
-        motion: a kind of `hand_motion`; "occlusion" puts a bar between the cameras and the path of the hand.
-        num_frames: number of frames.
-        fps: frames per second.
-        shape: the true shape; an adult right hand by default.
-        stereo: see `stereo_clouds`.
-        skin: see `stereo_clouds`.
-        num_points: see `stereo_clouds`; with 30 % outliers the default gives 500 to 1,000 points per frame.
-        outlier_ratio: see `stereo_clouds`.
-        obstacle: see `stereo_clouds`; None: none, or in "occlusion" a bar, its width and slant drawn from the seed.
-        bend: see `hand_motion`.
-        distance: see `hand_motion`.
-        seed: of motion and measurements.
-
-    Returns:
-        Clouds, one per frame.
-
-    References: Dewaele et al. 2006, section 5.
+    The motion is a kind of `hand_motion`; "occlusion" puts a bar between the cameras and the path of the hand, of a
+    width and slant drawn from the seed, unless an obstacle is given. All else is as in `stereo_clouds`; the shape is an
+    adult right hand by default, with 500 to 1,000 points per frame. Dewaele et al. 2006, section 5.
     """
     shape = Hand() if shape is None else shape
     poses = hand_motion(shape, motion, num_frames, fps, bend=bend, distance=distance, seed=seed)

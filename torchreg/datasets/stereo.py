@@ -58,19 +58,11 @@ _SURROUNDINGS, _FOREARM = _Surroundings(), _ForearmForm()
 
 @dataclass(frozen=True)
 class StereoView:
-    """Two pinhole cameras side by side that look along +z with -y up, and their noise.
+    """Two pinhole cameras side by side that look along +z with -y up, and their noise; metres and pixels.
 
-    The left one stands at (-baseline / 2, 0, 0), the right one at (+baseline / 2, 0, 0). A point at depth z has the
-    disparity ``focal * baseline / z``, so that an error of the disparity moves it along its ray by
-    ``z^2 * disparity_noise / (focal * baseline)``: 1.5 mm at 0.6 m by default.
-
-    Args:
-        baseline: metres between the cameras.
-        focal: focal length, pixels.
-        width: pixels per row.
-        height: pixels per column.
-        disparity_noise: standard deviation of the disparity, pixels.
-        lateral_noise: standard deviation of both picture coordinates, pixels.
+    They stand at (-+ baseline / 2, 0, 0). A point at depth z has the disparity ``focal * baseline / z``, so that an
+    error of the disparity moves it along its ray by ``z^2 * disparity_noise / (focal * baseline)``: 1.5 mm at 0.6 m by
+    default. Noises are standard deviations, of the disparity and of both picture coordinates.
     """
 
     baseline: float = 0.1
@@ -155,13 +147,8 @@ def stereo_clouds(
 class _StereoScene:
     """All surfaces before the cameras: the shape, its forearm if it is a hand, an obstacle, a wall.
 
-    Args:
-        surface: (T, V, 3) vertices of the skin.
-        others: (T, W, 3) vertices of forearm and obstacle.
-        faces: (F, 3) of the skin, the forearm and the obstacle.
-        owners: (F,) int64, the `_Owner` of each face.
-        volume: (2, 3) lower and upper corner of the working volume.
-        wall: (3,) depth of the wall straight ahead, and its slopes along x and y.
+    Vertices (T, ., 3) of the skin and of forearm and obstacle; the `_Owner` of each face; lower and upper corner of the
+    working volume; depth of the wall straight ahead, and its slopes along x and y.
     """
 
     shape: ArticulatedShape
@@ -237,12 +224,7 @@ def tube(rings: Tensor) -> TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class _VisiblePoints:
-    """Points of a frame that both cameras see, drawn in random order, per owner in the order of `_Owner`.
-
-    Args:
-        counts: pixels that show each owner.
-        points: (N, 3) float64 each, without noise.
-    """
+    """Points of a frame that both cameras see, without noise, in random order by `_Owner`; pixels that show each."""
 
     counts: list[int]
     points: list[Tensor]

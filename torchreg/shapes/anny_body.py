@@ -31,11 +31,8 @@ _UNIFORM_STD = 12**-0.5
 class Phenotypes(Features):
     """The blend weights of anny's phenotypes: products of hat functions, one per phenotype, in a compact basis.
 
-    Args:
-        anchors: of each phenotype, (A_k,) increasing values at which one of its hats is one and all others zero.
-        fixed: hats (C,) of what is not a coefficient.
-        mask: (W, sum A_k + C) of zeros and ones, the hats that each weight is the product of.
-        projection: (W, L) onto the basis.
+    ``anchors`` are the values at which a hat is one, ``fixed`` (C,) hats of what is no coefficient, ``mask``
+    (W, sum A_k + C) the hats that each weight is the product of, ``projection`` (W, L) onto the basis.
     """
 
     fixed: Tensor

@@ -114,12 +114,7 @@ class ArticulatedShape(Articulation):
 
     @classmethod
     def from_chain(
-        cls,
-        chain: Chain,
-        *,
-        free_base: bool = True,
-        nu: float | None = None,
-        dtype: torch.dtype | None = None,
+        cls, chain: Chain, *, free_base: bool = True, nu: float | None = None, dtype: torch.dtype | None = None
     ) -> ArticulatedShape:
         """Return the shape of a `pytorch_kinematics.Chain`: its tree, with the solids of its links or thin bones.
 

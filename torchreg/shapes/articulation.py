@@ -155,20 +155,14 @@ class Articulation(PosedTree):
         return self.surface.faces.to(self.rest.device)
 
     def fusion_length(self) -> Tensor:
-        """Return nu (), float64, metres.
-
-        Differentiable: in `log_nu`.
-        """
+        """Return nu (), float64, metres."""
         held = self._held()
         if held is not None:
             return held.fusion_length
         return (self.log_nu - self._started[0]).double().exp() * self.start_nu
 
     def bending_sharpness(self) -> Tensor:
-        """Return the sharpness of the bending skin (), float64.
-
-        Differentiable: in `log_sharpness`.
-        """
+        """Return the sharpness of the bending skin (), float64."""
         return (self.log_sharpness - self._started[1]).double().exp() * self.start_sharpness
 
     def forward(self, pose: Tensor) -> ShapeOutput:
@@ -208,10 +202,7 @@ class Articulation(PosedTree):
 
     @contextmanager
     def held_sizes(self) -> Iterator[None]:
-        """Evaluate bone lengths and radii once, not for every pose, in a ``with`` block; they must not change in it.
-
-        Poses of few points take a fifth less time.
-        """
+        """Evaluate bone lengths and radii once, not for every pose, in a ``with`` block; they must not change in it."""
         held = _HeldSizes(self, self._offset_scales(), self._scaled_sizes(), self._solid_poses(), self.fusion_length())
         token = _HELD.set(held)
         try:
@@ -232,17 +223,9 @@ class Articulation(PosedTree):
         return self.placed_distances(points, self.part_transforms(pose)).mT
 
     def placed_distances(self, points: Tensor, transforms: Tensor, parts: Sequence[int] | None = None) -> Tensor:
-        """Return the distance of points to the solids of parts under any part transforms, whatever the joints allow.
+        """Return distances (..., P, N) of points to solids, metres, negative inside, whatever the joints allow.
 
-        Args:
-            points: (..., N, 3), metres.
-            transforms: (..., P, 4, 4) ``T_world_part``, of the parts in ``parts``.
-            parts: indices of the parts; all by default.
-
-        Returns:
-            Distances (..., P, N), metres, negative inside.
-
-        Differentiable: in all.
+        ``transforms`` (..., P, 4, 4) are ``T_world_part`` of the given parts, by default of all.
         """
         local = self._local_planes(points, self._solid_frames(transforms, parts))
         return self.primitives.plane_distance(local, self._scaled_sizes(), parts)
@@ -271,17 +254,9 @@ class Articulation(PosedTree):
         ]
 
     def distances_without(self, points: Tensor, pose: Tensor, left_out: Sequence[Sequence[int]]) -> Tensor:
-        """Return the distance of points to the surface fused without some parts, for each of some sets of parts.
+        """Return distances (L, ..., N) of points to the surface fused without each of L sets of parts.
 
-        Args:
-            points: (..., N, 3), metres.
-            pose: (..., num_dofs).
-            left_out: L sets of indices of parts.
-
-        Returns:
-            Distances (L, ..., N), metres, negative inside; infinite where all parts are left out.
-
-        Differentiable: as `distance`.
+        They are infinite where all parts are left out.
         """
         each = self.part_distances(points, pose)
         gone = torch.zeros(len(left_out), each.shape[-1], dtype=torch.bool, device=each.device)
@@ -294,16 +269,9 @@ class Articulation(PosedTree):
     def distance_jacobian(
         self, points: Tensor, pose: Tensor, *, chart: str = "pose", parts: Sequence[int] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the fused distance and its analytic Jacobian with respect to all degrees of freedom.
+        """Return the fused distances (..., N) and their analytic Jacobian (..., N, num_dofs).
 
-        Args:
-            points: (..., N, 3), metres, fixed in the world.
-            pose: (..., num_dofs).
-            chart: see `part_twists`.
-            parts: indices of the parts to evaluate, as those of a limb; all by default.
-
-        Returns:
-            Distances (..., N) and Jacobian (..., N, num_dofs).
+        The points (..., N, 3) are fixed in the world; ``chart`` as in `part_twists`, ``parts`` as in `distance`.
         """
         transforms, linear, angular = self._twists(pose, chart)
         moves = self._part_moves

@@ -25,10 +25,7 @@ BONE_PRIOR = BonePrior()
 
 
 def bone_space(shape: Articulation, surface: RigSurface) -> LinearSpace:
-    """Return the space of relative changes of a rig's size and girth and of its parts' lengths and radii.
-
-    Lengths move the joints of a part's children and stretch its vertices along its bone, radii across it.
-    """
+    """Return the space of relative changes of a rig's size and girth and of its parts' lengths and radii."""
     frames = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
     index = shape.part_index
     positions, joints = frames[:, :3, 3], frames[index, :3, 3]

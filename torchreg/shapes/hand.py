@@ -22,12 +22,7 @@ _Vector = tuple[float, float, float]
 class _Finger:
     """Proportions of a finger of a right hand at rest; x: thumb side, y: back, z: to the tips.
 
-    Args:
-        lengths_mm: of the phalanges, from the base to the tip.
-        radii_mm: of the phalanges, across.
-        dorsal: direction of the finger's back.
-        joints: names of the joints, each with its motions and their limits in degrees.
-        overlap: factor on the lengths of inner phalanges' ellipsoids, so that neighbors overlap and fuse smoothly.
+    Joints have motions and their limits in degrees; ``overlap`` lengthens inner ellipsoids, so that they fuse smoothly.
     """
 
     base_mm: _Vector

@@ -131,7 +131,7 @@ def build_chain(tree: KinematicTree, names: Sequence[str], offsets: Tensor) -> C
     frames: list[Frame] = []
     taken: set[str] = set()
     for joint, name, offset in zip(tree.joints, names, offsets.detach(), strict=True):
-        name = _new_name(name.strip("\n"), taken)
+        name = new_name(name.strip("\n"), taken)
         frame = pk.Frame(name, link=pk.Link(name))
         frame.joint = pk.Joint(
             joint.name, offset=pk.Transform3d(matrix=offset.unsqueeze(0), **kind), joint_type=joint.kind,
@@ -198,7 +198,7 @@ def _read_joint(frame: Frame, parent: int, taken: set[str]) -> Joint:
         if part is not None:
             offset = offset @ part.get_matrix()[0].detach().cpu().double()
     if joint.joint_type == "fixed":
-        return Joint(_new_name(name, taken), parent, offset)
+        return Joint(new_name(name, taken), parent, offset)
     lower, upper = (-math.inf, math.inf) if joint.limits is None else joint.limits
     x, y, z = joint.axis.detach().cpu().double().tolist()
     return Joint(
@@ -220,7 +220,7 @@ def _read_geometry(frame: Frame) -> tuple[tuple[UrdfPrimitive, ...], bool]:
     return tuple(solids), len(known) == len(visuals)
 
 
-def _new_name(name: str, taken: set[str]) -> str:
+def new_name(name: str, taken: set[str]) -> str:
     """Return the name, lengthened while it is among those taken, which it joins."""
     while name in taken:
         name += "_"

@@ -48,12 +48,9 @@ class ShapeOutput(NamedTuple):
 
 
 class MaterialPoints(nn.Module):
-    """Points that move by a weighted mean of the motions of parts, with weights of a file or of eq. 3.
+    """Points that move by a weighted mean of the motions of parts, with weights (N, P) of a file or of eq. 3.
 
-    Args:
-        to_parts: (P, 4, 4) ``T_part_world`` in the reference pose.
-        weights: (N, P), rows sum to one; under eq. 3 one for the dominating part.
-        partners: (N, P) for the strongest neighbor of that part; None for the weights of a file.
+    Under eq. 3 weights are one for the dominating part, and ``partners`` (N, P) for its strongest neighbor.
     """
 
     points: Tensor
@@ -122,12 +119,7 @@ def fused_points(
 
 
 def onto_fused(
-    solids: PrimitiveSet,
-    sizes: Sequence[Tensor],
-    frames: Tensor,
-    points: Tensor,
-    fuses: Tensor,
-    nu: float | Tensor,
+    solids: PrimitiveSet, sizes: Sequence[Tensor], frames: Tensor, points: Tensor, fuses: Tensor, nu: float | Tensor
 ) -> Tensor:
     """Return points (..., N, 3) after one Newton step onto their fused surface, ``x - d grad d / |grad d|^2``."""
     inverse = frames[..., :3].mT

@@ -77,7 +77,7 @@ OPENXR_PARTS: dict[str, str] = {"PALM": "palm", **{_openxr_name(name): part for 
 _XR_KEYPOINTS = {
     "webxr": [
         WEBXR_JOINTS.index(name) for key in _KEYPOINTS for name, (_, keypoint) in _WEBXR.items() if keypoint == key
-    ],
+    ]
 }
 _XR_KEYPOINTS["openxr"] = [index + 1 for index in _XR_KEYPOINTS["webxr"]]
 _XR_SIZES = {"webxr": len(WEBXR_JOINTS), "openxr": len(OPENXR_JOINTS)}
@@ -85,18 +85,11 @@ _XR_SIZES = {"webxr": len(WEBXR_JOINTS), "openxr": len(OPENXR_JOINTS)}
 
 @dataclass(frozen=True)
 class ManoPose:
-    """A hand's pose as MANO's parameters, without the mean pose that MANO may add (``flat_hand_mean=True``).
+    """A hand's pose as MANO's parameters, without the mean pose that MANO may add (``flat_hand_mean=True``)."""
 
-    Args:
-        global_orient: (..., 3) rotation vector of the wrist, radians.
-        hand_pose: (..., 15, 3) rotation vectors of the joints in their parents: index, middle, little, ring, thumb,
-            three each from base to tip.
-        wrist: (..., 3) position of the wrist, metres. MANO's ``transl`` is this less its own wrist in the rest pose.
-    """
-
-    global_orient: Tensor
-    hand_pose: Tensor
-    wrist: Tensor
+    global_orient: Tensor  # (..., 3) rotation vector of the wrist, radians
+    hand_pose: Tensor  # (..., 15, 3) in the parents: index, middle, little, ring, thumb, three each from base to tip
+    wrist: Tensor  # (..., 3) position, metres; MANO's ``transl`` is this less its own wrist in the rest pose
 
 
 def reorder_keypoints(keypoints: Tensor, source: str, target: str) -> Tensor:

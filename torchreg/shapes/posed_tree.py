@@ -180,19 +180,7 @@ class PosedTree(nn.Module):
         return difference(start, end)
 
     def frame_transforms(self, pose: Tensor) -> Tensor:
-        """Return ``T_world_frame`` of every frame of the tree.
-
-        Args:
-            pose: (..., num_dofs).
-
-        Returns:
-            (..., F, 4, 4).
-
-        Raises:
-            InputError: if the pose has the wrong size.
-
-        Differentiable: in ``pose`` and `log_length_scales`.
-        """
+        """Return ``T_world_frame`` (..., F, 4, 4) of every frame of the tree in poses (..., num_dofs)."""
         check_shape(pose, "pose", (self.num_dofs,), batch=True)
         base = rigid_matrix(so3_exp(pose[..., 3:6]), pose[..., :3])
         return base.unsqueeze(-3) @ self.kinematics(pose[..., 6:], self._offset_scales())
@@ -220,29 +208,14 @@ class PosedTree(nn.Module):
         return self.placed_keypoints(self.part_transforms(pose))
 
     def placed_keypoints(self, transforms: Tensor) -> Tensor:
-        """Return the keypoints for given part transforms.
-
-        Args:
-            transforms: (..., P, 4, 4) ``T_world_part``.
-
-        Returns:
-            (..., K, 3), metres, as `keypoints`.
-
-        Differentiable: in ``transforms`` and `log_length_scales`.
-        """
+        """Return the keypoints (..., K, 3) for part transforms (..., P, 4, 4) ``T_world_part``, as `keypoints`."""
         return transforms[..., :3, 3]
 
     def part_twists(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
-        """Return the part transforms and the twist each degree of freedom gives to each part.
+        """Return part transforms (..., P, 4, 4) and the twists (..., P, num_dofs, 6) by each degree of freedom.
 
-        A point x of part p moves by ``twist[p, k, :3] + twist[p, k, 3:] x x`` per unit of degree of freedom k.
-
-        Args:
-            pose: (..., num_dofs).
-            chart: "pose" for derivatives with respect to the pose vector, "tangent" for steps taken with `retract`.
-
-        Returns:
-            transforms (..., P, 4, 4) and twists (..., P, num_dofs, 6) as (translation, rotation).
+        A point x of part p moves by ``twist[p, k, :3] + twist[p, k, 3:] x x`` per unit of degree of freedom k: of the
+        pose vector, or with the chart "tangent" of steps taken with `retract`.
         """
         transforms, linear, angular = self._twists(pose, chart)
         twists = torch.cat([linear, angular], dim=-1).unsqueeze(-3) * self._part_moves.unsqueeze(-1)
@@ -261,14 +234,9 @@ class PosedTree(nn.Module):
         return linear, torch.cat([angular, joints[..., 3:]], dim=-2)
 
     def transform_jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
-        """Return the stacked part transforms, in whose rows skins are linear, and their analytic derivatives.
+        """Return rows (..., 4 P, 3), for each part the transposed ``[R | t]``, and their derivatives (..., num_dofs).
 
-        Args:
-            pose: (..., num_dofs).
-            chart: see `part_twists`.
-
-        Returns:
-            Rows (..., 4 P, 3), for each part the transposed ``[R | t]``, and derivatives (..., 4 P, 3, num_dofs).
+        Skins are linear in the rows; ``chart`` as in `part_twists`.
         """
         transforms, linear, angular = self._twists(pose, chart)
         rows = transforms.mT
@@ -290,14 +258,7 @@ class PosedTree(nn.Module):
         return self._owners
 
     def length_motions(self, frames: Tensor) -> Tensor:
-        """Return how far frames move as the logarithm of each part's length grows.
-
-        Args:
-            frames: (..., F, 4, 4) of a pose, see `frame_transforms`.
-
-        Returns:
-            (..., F, 3, P), metres.
-        """
+        """Return how far frames (..., F, 4, 4) move as log lengths of parts grow: (..., F, 3, P), metres."""
         above = frames[..., [max(joint.parent, 0) for joint in self.kinematics.tree.joints], :3, :3]
         offsets = self.kinematics.lengths.unflatten(-1, (4, 4))[:, :3, 3] * self._offset_scales().unsqueeze(-1)
         offsets = above @ offsets.to(frames).unsqueeze(-1)

@@ -50,8 +50,7 @@ def refine_primitives(
     """Return solids moved, turned and resized so that their fused surface runs through points (N, 3) on the surface.
 
     Damped least squares over all solids at once (Marquardt 1963): the fused distance of every point, with less weight
-    the distance to its own solid (N,) and its excess over that to the nearest solid, and a weak prior at the start,
-    which holds solids observed in part. The solids have poses in the points' coordinates.
+    the distance to its own solid and its excess over that to the nearest one, and a weak prior at the start.
     """
     solids = PrimitiveSet(primitives).requires_grad_(False)
     problem = _RefinementProblem(solids, neighbors, nu, points.double(), owners)
@@ -80,12 +79,8 @@ def refine_primitives(
 class _Fields:
     """The distances of all points in one state.
 
-    Args:
-        offset: (P, width) of the state from the start, centers in the solids' frames.
-        local: (P, 3, N) points in the frames of the solids.
-        shares: (N, P) of the solids in the fused distance.
-        residuals: (N, 3) fused distance, that to the own solid, and its excess over that to the nearest one.
-        squared: (N, 3) squares of the residuals, in robust scales.
+    ``residuals`` (N, 3): the fused distance, that to the own solid, and its excess over that to the nearest one;
+    ``squared`` in robust scales. ``local`` (P, 3, N) in the frames of the solids, ``shares`` (N, P) of the fused one.
     """
 
     offset: Tensor

@@ -24,17 +24,11 @@ _MIN_EXPONENT = -120.0
 
 @dataclass(frozen=True)
 class Primitive:
-    """One solid of a part, with its long axis along z.
+    """One solid of a part, with its long axis along z."""
 
-    Args:
-        kind: "ellipsoid", "capsule", "cone" or "superquadric".
-        sizes: the kind's sizes, metres; see `torchreg.geometry.primitives`.
-        pose: (4, 4) ``T_part_primitive``.
-    """
-
-    kind: str
-    sizes: tuple[float, ...]
-    pose: Tensor
+    kind: str  # "ellipsoid", "capsule", "cone" or "superquadric"
+    sizes: tuple[float, ...]  # the kind's sizes, metres; see `torchreg.geometry.primitives`
+    pose: Tensor  # (4, 4) ``T_part_primitive``
 
 
 class DeferredSolids:

@@ -30,12 +30,9 @@ class HandSpec:
 
 @dataclass(frozen=True)
 class ShapeRecord:
-    """A shape as plain data.
+    """A shape as plain data: what is learned and what it multiplies, and which of it requires gradients.
 
-    Args:
-        parameters: what is learned and what it multiplies: logarithms of lengths and radii, centers and sizes of the
-            solids, logarithms of nu and of the sharpness. Earlier releases left the last two out.
-        learnable: which of them require gradients.
+    Earlier releases left the last two parameters, the logarithms of nu and of the sharpness, out.
     """
 
     spec: ShapeSpec | HandSpec

@@ -19,7 +19,7 @@ from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import rotation_between
 from torchreg.io.urdf import load_urdf
 from torchreg.io.urdf_file.record import UrdfPrimitive, UrdfRecord
-from torchreg.shapes.kinematics import ForwardKinematics, read_chain
+from torchreg.shapes.kinematics import ForwardKinematics, new_name, read_chain
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.spec import SOLID_CHOICES, RigSurface, ShapeSpec, fitted_solid, fusion_length, with_long_axis
@@ -50,11 +50,7 @@ _FIT = _RobotFit()
 
 
 def spec_from_urdf(
-    path: str | Path,
-    *,
-    package_dirs: Sequence[str | Path] = (),
-    primitive: str = "auto",
-    meshes: str = "warn",
+    path: str | Path, *, package_dirs: Sequence[str | Path] = (), primitive: str = "auto", meshes: str = "warn"
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a URDF robot; see `ArticulatedShape.from_urdf`."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
@@ -107,11 +103,11 @@ def _spec_of(record: UrdfRecord, primitive: str, empty: str) -> ShapeSpec:
             frame = joints[link].name
             if number > 0:
                 # A further solid of a link is carried by a fixed frame of its own.
-                frame = _new_name(f"{frame}_{number}", [joint.name for joint in joints])
+                frame = new_name(f"{frame}_{number}", {joint.name for joint in joints})
                 joints.append(Joint(frame, link, torch.eye(4, dtype=torch.float64)))
             part_frames.append(frame)
             name = record.link_names[link]
-            part_names.append(_new_name(f"{name}_{number}", record.link_names) if number else name)
+            part_names.append(new_name(f"{name}_{number}", {*record.link_names}) if number else name)
             links.append(link)
             solids.append(solid)
     if not solids:
@@ -131,7 +127,7 @@ def _own_names(joints: Sequence[Joint]) -> list[Joint]:
     found = list(joints)
     for index, joint in enumerate(joints):
         if joint.name in BASE_DOF_NAMES and joint.kind != "fixed" and joint.mimic is None:
-            found[index] = replace(joint, name=_new_name(f"{joint.name}_joint", [other.name for other in joints]))
+            found[index] = replace(joint, name=new_name(f"{joint.name}_joint", {other.name for other in joints}))
             warnings.warn(
                 f"joint {joint.name!r} is called {found[index].name!r} here, as {joint.name} moves the whole robot",
                 FileWarning,
@@ -255,9 +251,3 @@ def _part_colors(record: UrdfRecord, links: Sequence[int]) -> Tensor:
     """Return the colors (P, 3) of parts on links."""
     known = record.link_colors or [None] * len(record.link_names)
     return torch.tensor([known[link] or _FIT.color for link in links])
-
-
-def _new_name(name: str, taken: Sequence[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name

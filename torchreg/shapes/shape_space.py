@@ -84,12 +84,7 @@ class Features(nn.Module):
 
 
 class LinearSpace(ShapeSpace):
-    """Rest states that are linear in features of the coefficients, ``vertices + vertex_dirs @ features(c)``.
-
-    Args:
-        vertex_dirs: (V, 3, L).
-        features: takes coefficients (..., K) to features (..., L); None where they are the coefficients.
-    """
+    """Rest states linear in features of the coefficients, ``vertices + vertex_dirs @ features(c)``; None: in them."""
 
     vertices: Tensor
     vertex_dirs: Tensor
@@ -138,13 +133,10 @@ class LinearSpace(ShapeSpace):
 
 
 class FunctionSpace(ShapeSpace):
-    """Rest states of any function of the coefficients.
+    """Rest states of any function of coefficients (..., K), twice differentiable row by row.
 
-    Args:
-        function: takes coefficients (..., K) to vertices (..., V, 3) and positions of the joints (..., J, 3), metres;
-            differentiable twice, and of each row of coefficients by itself.
-        owners: (F,) the joint at which each frame of the tree lies.
-        index: (U,) vertices that count; all if None.
+    It gives vertices (..., V, 3) and joints (..., J, 3), metres; ``owners`` (F,) are the joints of the frames of the
+    tree, ``index`` (U,) the vertices that count.
     """
 
     owners: Tensor

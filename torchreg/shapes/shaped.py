@@ -19,13 +19,7 @@ from torchreg.shapes.shape_space import ShapeSpace
 
 
 class _Posed(NamedTuple):
-    """A rig in states: the quantities that points and their derivatives share.
-
-    Args:
-        above: (..., F, 3, 3) turn from rest of what carries each frame.
-        turns: (..., P, 3, 3) S_p.
-        offsets: (..., P, 3) ``t_p - S_p j_p``.
-    """
+    """A rig in states: ``above`` (..., F, 3, 3) turns what carries each frame, ``turns`` S_p and ``t_p - S_p j_p``."""
 
     pose: Tensor
     coefficients: Tensor
@@ -120,14 +114,9 @@ def blended(posed: _Posed, weights: Tensor, rest: Tensor) -> tuple[Tensor, Tenso
 
 
 class ShapedSkin(nn.Module):
-    """Points of a rig's surface that move with its pose and its coefficients.
+    """Points of a rig's surface that move with its pose and its coefficients: at shares (N, C) of its corners.
 
     Like a `LinearBlendSkin` it is linear in rows; these are the points themselves, followed by their normals.
-
-    Args:
-        corners: (N, C) vertices between which each point lies: one, or the three of a face.
-        shares: (N, C) barycentric weights.
-        weights: (N, P) of skinning, rows sum to one.
     """
 
     corners: Tensor

@@ -20,12 +20,9 @@ SOLID_CHOICES = ("auto", *PRIMITIVE_KINDS)
 
 @dataclass(frozen=True)
 class RigSurface:
-    """The surface mesh of a file, in the pose of all zeros.
+    """The surface mesh of a file, in the pose of all zeros, with weights (V, P) and colors (P, 3) from 0 to 1.
 
-    Args:
-        weights: (V, P) over the parts, rows sum to one.
-        is_rigid: whether it is made of rigid links, whose vertices are few or many wherever their makers liked.
-        colors: (P, 3) of the parts, red, green, blue from 0 to 1, where the file has any.
+    Vertices of rigid links are few or many wherever their makers liked.
     """
 
     vertices: Tensor

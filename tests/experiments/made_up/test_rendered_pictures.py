@@ -69,19 +69,6 @@ def test_depth_and_mask_are_those_of_the_sphere(ball):
     assert 0 <= picture.image.min() <= picture.image.max() <= 1
 
 
-def test_noise_is_as_asked_for_before_a_wall_that_is_where_it_says(ball):
-    style = PictureStyle(wall=0.8, noise=0.02)
-    first, other = (render(ball, CAMERA, style=style, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
-    assert torch.allclose(first.depth[~first.mask], first.depth.new_tensor(0.8))
-    assert float((other.image - first.image).std()) == pytest.approx(0.02 * 2**0.5, rel=0.1)
-    assert not torch.allclose(render(ball, CAMERA, style=style, seed=3).image, first.image, atol=0.1)
-    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    noise, near, far = (value_noise(points + step, 0.01) for step in (0.0, 1e-5, 0.02))
-    assert noise.abs().max() <= 1
-    assert (near - noise).abs().max() < 0.02
-    assert max(abs(float(noise.mean())), abs(float((far * noise).mean()))) < 0.03
-
-
 def test_texture_moves_with_the_surface(ball):
     style = PictureStyle(noise=0.0, light=(0.0, 0.0, -1.0))
     still = render(ball, CAMERA, style=style)
@@ -93,23 +80,6 @@ def test_texture_moves_with_the_surface(ball):
     away = tr.TriangleMesh(ball.vertices + step, ball.faces)
     other = tr.Camera.looking_at(step, step + step.new_tensor([0, 0, 1]), focal=60.0, width=48, height=40)
     assert torch.allclose(render(away, other, ball.vertices, style=style).image, still.image, atol=1e-6)
-
-
-def test_hand_before_a_pair_and_in_a_ring(video):
-    pair = stereo_cameras(width=80, height=60, focal=75.0)
-    assert pair.is_rectified
-    assert pair.baseline == pytest.approx(0.12)
-    left, right = video(pair, style=PictureStyle(wall=0.9), forearm=False)
-    assert left.mask.sum() > 50
-    # The disparity of the hand is about that of its distance.
-    middle = [picture.mask.nonzero()[:, 1].double().mean() for picture in (left, right)]
-    expected = pair.disparity(left.depth[left.mask].mean())
-    assert float(middle[0] - middle[1]) == pytest.approx(float(expected), abs=1.5)
-    ring = camera_ring([0.0, 0.0, 0.6], 0.5, 5, focal=50.0, width=48, height=48)
-    pictures = video(ring, forearm=False)
-    assert len(pictures) == len(ring) == 5
-    assert all(picture.mask.sum() > 20 for picture in pictures)
-    assert all(camera.project(torch.tensor([[0.0, 0.0, 0.6]]))[1].item() == pytest.approx(0.5) for camera in ring)
 
 
 def test_video_is_what_single_pictures_show(video, plain_hand, plain_hand_surface, pair):
