@@ -33,12 +33,8 @@ def calibrate(hand, skin, clouds, mask=None, **options):
     return tr.calibrate(hand, clouds, masks=mask, config=tr.CalibrateConfig(align=DESCENT), **options)
 
 
-FUNCTIONS = [
-    (align, "data", "mask"),
-    (find_pose, "data", "mask"),
-    (initialize, "points", "mask"),
-    (calibrate, "frames", "masks"),
-]
+NAMES = ("data", "mask"), ("data", "mask"), ("points", "mask"), ("frames", "masks")
+FUNCTIONS = [(call, *names) for call, names in zip((align, find_pose, initialize, calibrate), NAMES, strict=True)]
 
 
 def clouds_with(value):
@@ -58,42 +54,12 @@ def clouds_with(value):
         (torch.zeros(2, 0, 3), None, INPUT, r"NAME must hold at least one point, got shape \(2, 0, 3\)"),
         (torch.zeros(2, 5, 2), None, INPUT, r"NAME must have shape \(.*, M, 3\), got \(2, 5, 2\)"),
         (torch.zeros(3), None, INPUT, r"NAME must have shape \(.*M, 3\), got \(3,\)"),
-        (
-            torch.zeros(2, 5, 3) > 0,
-            None,
-            TYPE,
-            r"NAME must hold real numbers, got dtype torch\.bool",
-        ),
-        (
-            clouds_with(math.nan),
-            None,
-            INPUT,
-            "NAME hold 3 points that are not finite; drop them or set .*omit",
-        ),
-        (
-            clouds_with(math.inf),
-            None,
-            INPUT,
-            "NAME hold 3 points that are not finite; drop them or set .*omit",
-        ),
-        (
-            clouds_with(0),
-            torch.ones(2, 20),
-            TYPE,
-            "MASK must be a tensor of bool, False where NAME are",
-        ),
-        (
-            clouds_with(0),
-            torch.ones(20) > 0,
-            INPUT,
-            r"MASK must have shape \(2, 20\) like the NAME, got \(20,\)",
-        ),
-        (
-            clouds_with(0),
-            torch.ones(2, 20) < 0,
-            INPUT,
-            "NAME hold no point that is finite and not masked",
-        ),
+        (torch.zeros(2, 5, 3) > 0, None, TYPE, r"NAME must hold real numbers, got dtype torch\.bool"),
+        (clouds_with(math.nan), None, INPUT, "NAME hold 3 points that are not finite; drop them or set .*omit"),
+        (clouds_with(math.inf), None, INPUT, "NAME hold 3 points that are not finite; drop them or set .*omit"),
+        (clouds_with(0), torch.ones(2, 20), TYPE, "MASK must be a tensor of bool, False where NAME are"),
+        (clouds_with(0), torch.ones(20) > 0, INPUT, r"MASK must have shape \(2, 20\) like the NAME, got \(20,\)"),
+        (clouds_with(0), torch.ones(2, 20) < 0, INPUT, "NAME hold no point that is finite and not masked"),
     ],
 )
 def test_bad_clouds_and_masks(plain_hand, plain_hand_skin, function, name, mask_name, clouds, mask, error, message):
@@ -266,18 +232,8 @@ def test_bad_arguments(given, call, error, message):
 @pytest.mark.parametrize(
     ("config", "options", "error", "message"),
     [
-        (
-            tr.AlignConfig,
-            {"search": "often"},
-            INPUT,
-            "search must be one of auto, always, never; got 'often'",
-        ),
-        (
-            tr.AlignConfig,
-            {"correspondence": "icp"},
-            INPUT,
-            "correspondence must be one of em, softassign",
-        ),
+        (tr.AlignConfig, {"search": "often"}, INPUT, "search must be one of auto, always, never; got 'often'"),
+        (tr.AlignConfig, {"correspondence": "icp"}, INPUT, "correspondence must be one of em, softassign"),
         (tr.AlignConfig, {"outlier": "none"}, INPUT, "outlier must be one of limit, volume"),
         (tr.AlignConfig, {"nan_policy": "drop"}, INPUT, "nan_policy must be one of raise, omit"),
         (tr.AlignConfig, {"upright": (0, 1)}, INPUT, "upright must have shape"),
@@ -285,12 +241,7 @@ def test_bad_arguments(given, call, error, message):
         (tr.FindPoseConfig, {"upright": (0, math.nan, 1)}, INPUT, "upright must be finite"),
         (tr.AlignConfig, {"em_steps": 0}, INPUT, "em_steps must be at least 1, got 0"),
         (tr.AlignConfig, {"m_steps": 1.5}, TYPE, "m_steps must be an integer, got float"),
-        (
-            tr.AlignConfig,
-            {"num_candidates": True},
-            TYPE,
-            "num_candidates must be an integer, got bool",
-        ),
+        (tr.AlignConfig, {"num_candidates": True}, TYPE, "num_candidates must be an integer, got bool"),
         (tr.AlignConfig, {"surface_steps": -1}, INPUT, "surface_steps must be at least 0, got -1"),
         (tr.AlignConfig, {"sharpness": 0.0}, INPUT, "sharpness must be positive and finite"),
         (tr.AlignConfig, {"pose_atol": -1.0}, INPUT, "pose_atol must be zero or positive"),
@@ -298,20 +249,10 @@ def test_bad_arguments(given, call, error, message):
         (tr.AlignConfig, {"inlier_distance": 0.0}, INPUT, "inlier_distance must be positive"),
         (tr.AlignConfig, {"prior_std": -1.0}, INPUT, "prior_std must be positive"),
         (tr.FindPoseConfig, {"num_placed": -1}, INPUT, "num_placed must be at least 1, got -1"),
-        (
-            tr.FindPoseConfig,
-            {"num_searched": 1.5},
-            TYPE,
-            "num_searched must be an integer, got float",
-        ),
+        (tr.FindPoseConfig, {"num_searched": 1.5}, TYPE, "num_searched must be an integer, got float"),
         (tr.FindPoseConfig, {"num_retries": -1}, INPUT, "num_retries must be at least 0, got -1"),
         (tr.FindPoseConfig, {"prior_std": 0.0}, INPUT, "prior_std must be positive and finite, got 0.0"),
-        (
-            tr.FindPoseConfig,
-            {"nan_policy": "drop"},
-            INPUT,
-            "nan_policy must be one of raise, omit; got 'drop'",
-        ),
+        (tr.FindPoseConfig, {"nan_policy": "drop"}, INPUT, "nan_policy must be one of raise, omit; got 'drop'"),
         (tr.PoseInitializerConfig, {"noise": 0.0}, INPUT, "noise must be positive"),
         (tr.PoseInitializerConfig, {"fit_steps": 0}, INPUT, "fit_steps must be at least 1"),
         (tr.PoseInitializerConfig, {"chunk": 0}, INPUT, "chunk must be at least 1"),
