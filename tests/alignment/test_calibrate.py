@@ -7,7 +7,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import joint, shape_of, solid
-from torchreg.datasets.hand import hand_motion, make_hand_cloud, random_hand_pose
+from torchreg.datasets.hand import make_hand_cloud, random_hand_pose
 from torchreg.shapes.scale_jacobian import scale_jacobian
 
 
@@ -101,28 +101,21 @@ def test_lengths_radii_and_poses_come_back(arm_found, arm_truth, arm_poses):
     torch.testing.assert_close(found.shape.log_radius_scales.detach(), found.log_radius_scales)
 
 
-def test_the_given_shape_is_not_changed(arm_found, arm_frames, arm_starts):
-    shape, found, _ = arm_found
+def test_the_given_shape_is_not_changed_and_records_end_with_the_result(arm_found, arm_frames, arm_starts):
+    shape, found, records = arm_found
     assert float(shape.log_length_scales.detach().abs().max()) == 0.0
     assert found.shape is not shape
-    assert found.shape.part_names == shape.part_names
     assert not any(parameter.requires_grad for parameter in found.shape.parameters())
+    assert [(record.round, record.step, record.num_steps) for record in records] == [(0, 0, 3), (0, 1, 3), (0, 2, 3)]
+    sigmas = [record.sigma for record in records]
+    assert sigmas == sorted(sigmas, reverse=True)
+    for name in ("poses", "log_length_scales", "log_radius_scales", "cost"):
+        torch.testing.assert_close(torch.as_tensor(getattr(records[-1], name)), getattr(found, name))
     learning = make_arm()
     learning.log_length_scales.requires_grad_(True)
     copied = tr.calibrate(learning, arm_frames[:1], arm_starts[:1], config=ARM_CONFIG).shape
     learnt = [name for name, parameter in copied.named_parameters() if parameter.requires_grad]
     assert learnt == ["log_length_scales"]
-
-
-def test_records_tell_how_the_kernel_narrows(arm_found):
-    _, found, records = arm_found
-    assert [(record.round, record.step, record.num_steps) for record in records] == [(0, 0, 3), (0, 1, 3), (0, 2, 3)]
-    sigmas = [record.sigma for record in records]
-    assert sigmas == sorted(sigmas, reverse=True)
-    torch.testing.assert_close(records[-1].poses, found.poses)
-    torch.testing.assert_close(records[-1].log_length_scales, found.log_length_scales)
-    torch.testing.assert_close(records[-1].log_radius_scales, found.log_radius_scales)
-    assert records[-1].cost == pytest.approx(float(found.cost))
 
 
 def test_a_sequence_of_clouds_is_one_tensor_with_a_mask(arm_frames, arm_starts):
@@ -141,15 +134,17 @@ def test_a_sequence_of_clouds_is_one_tensor_with_a_mask(arm_frames, arm_starts):
     assert float((few.log_length_scales - listed.log_length_scales).abs().max()) < 0.03
 
 
-def test_a_frame_that_shows_something_else_does_not_count(arm_frames, arm_starts, arm_found):
+def test_a_frame_that_shows_something_else_does_not_count_also_far_away(arm_frames, arm_starts, arm_found):
+    away = torch.tensor([300.0, -200.0, 100.0])
     generator = torch.Generator().manual_seed(6)
     clutter = arm_starts[:1, :3] + torch.tensor([0.0, 0.0, 2.0]) + torch.rand(385, 3, generator=generator)
-    frames = torch.cat([arm_frames, clutter.unsqueeze(0)])
     starts = torch.cat([arm_starts, arm_starts[:1]])
-    found = tr.calibrate(make_arm(), frames, starts, config=ARM_CONFIG)
+    starts[:, :3] += away
+    found = tr.calibrate(make_arm(), torch.cat([arm_frames, clutter.unsqueeze(0)]) + away, starts, config=ARM_CONFIG)
     assert found.status is tr.Status.FEW_INLIERS
-    torch.testing.assert_close(found.log_length_scales, arm_found[1].log_length_scales, rtol=0, atol=2e-3)
-    torch.testing.assert_close(found.poses[:4], arm_found[1].poses, rtol=0, atol=5e-3)
+    torch.testing.assert_close(found.log_length_scales, arm_found[1].log_length_scales, rtol=0, atol=3e-3)
+    torch.testing.assert_close(found.poses[:4, :3] - away, arm_found[1].poses[:, :3], rtol=0, atol=1e-3)
+    torch.testing.assert_close(found.poses[:4, 3:], arm_found[1].poses[:, 3:], rtol=0, atol=5e-3)
 
 
 def test_the_prior_rules_what_is_not_seen(arm_truth, arm_poses, arm_starts):
@@ -165,15 +160,6 @@ def test_the_prior_rules_what_is_not_seen(arm_truth, arm_poses, arm_starts):
     stiff = tr.CalibrateConfig(align=ARM_CONFIG.align, rounds=1, size_std=1e-4, radius_std=1e-4, part_std=1e-4)
     held = tr.calibrate(make_arm(), frames, arm_starts, config=stiff)
     assert float(held.log_length_scales.abs().max()) < 2e-3
-
-
-def test_moving_all_frames_moves_the_poses_only(arm_frames, arm_starts, arm_found):
-    away = torch.tensor([300.0, -200.0, 100.0])
-    starts = arm_starts.clone()
-    starts[:, :3] += away
-    found = tr.calibrate(make_arm(), arm_frames + away, starts, config=ARM_CONFIG)
-    torch.testing.assert_close(found.log_length_scales, arm_found[1].log_length_scales, rtol=0, atol=3e-3)
-    torch.testing.assert_close(found.poses[:, :3] - away, arm_found[1].poses[:, :3], rtol=0, atol=1e-3)
 
 
 def test_a_bolted_machine_in_double_precision():
@@ -213,63 +199,15 @@ def test_scale_jacobian_matches_differences(kind):
 # The hand
 
 
-@pytest.fixture(scope="module")
-def other_hand(plain_hand):
-    """A hand 5 % shorter and 5 % thicker, with another skin; nine frames of it."""
-    generator = torch.Generator().manual_seed(11)
-    truth = tr.Hand(nu=0.0035)
-    set_scales(truth, [math.log(0.95)] * 16, [math.log(1.05)] * 16).requires_grad_(False)
-    mesh = truth.surface_mesh(spacing=0.005)
-    skin = tr.BendingSkin(truth, mesh.vertices, sharpness=3.0, faces=mesh.faces)
-    poses = hand_motion(truth, "bend", 9, fps=4.0, bend=0.45, seed=1)
-    clouds = [make_hand_cloud(truth, pose, camera=torch.zeros(3), skin=skin, generator=generator) for pose in poses]
-    signs = 1 - 2.0 * (torch.rand(9, 21, generator=generator) < 0.5)
-    starts = poses.clone()
-    starts[:, 6:] += math.radians(15) * signs
-    return truth, poses, clouds, starts
-
-
-def tip_errors(hand, poses, truth, true_poses, clouds):
-    """Return the distances of fingertips with at least 8 points from their true places, metres."""
-    off = (hand.keypoints(poses) - truth.keypoints(true_poses)).norm(dim=-1)[:, 4::4].detach()
-    seen = [[int((cloud.part_labels == part).sum()) >= 8 for part in truth.fingertip_parts] for cloud in clouds]
-    return off[torch.tensor(seen)]
-
-
-@pytest.mark.slow
-def test_a_hand_of_other_proportions_seen_from_one_side(plain_hand, other_hand):
-    """Three frames of 500 points, 1.5 mm noise, a third outliers; then new frames are fitted with the shape found."""
-    truth, poses, clouds, starts = other_hand
-    frames = torch.stack([cloud.points for cloud in clouds])
-    found = tr.calibrate(plain_hand, frames[:3], starts[:3])
-    before, after = (
-        (hand.log_length_scales - truth.log_length_scales).abs().mean() for hand in (plain_hand, found.shape)
-    )
-    assert float(before) > 0.049
-    assert float(after) < 0.02
-    # Started near the truth, so that the shape alone makes the difference.
-    errors = []
-    for hand in (plain_hand, found.shape):
-        fitted = tr.align(hand, frames[5:], poses[5:], config=tr.AlignConfig(search="never"))
-        errors.append(tip_errors(hand, fitted.pose, truth, poses[5:], clouds[5:]))
-    assert len(errors[0]) >= 10
-    # The median, because a descent loses a finger now and then whatever the shape.
-    assert float(errors[1].median()) < 0.003
-    assert float(errors[1].median()) < 0.6 * float(errors[0].median())
-
-
 def test_a_hand_of_another_size_is_searched_in_clouds_and_what_shows_none_is_left_out(plain_hand):
     """The first two frames show a smaller hand, turned otherwise in each, the third a box."""
     truth = set_scales(tr.Hand(), [math.log(0.88)] * 16, [math.log(0.88)] * 16).requires_grad_(False)
     poses = torch.stack([random_hand_pose(truth, torch.Generator().manual_seed(seed), bend=0.3) for seed in (20, 21)])
     generator = torch.Generator().manual_seed(0)
-    clouds = [
-        make_hand_cloud(truth, pose, num_points=600, outlier_ratio=0.0, generator=generator).points for pose in poses
-    ]
+    clouds = [make_hand_cloud(truth, pose, num_points=600, outlier_ratio=0.0, generator=generator).points
+              for pose in poses]  # fmt: skip
     box = torch.rand(600, 3, generator=generator)
-    box[torch.arange(600), torch.randint(3, (600,), generator=generator)] = torch.randint(
-        2, (600,), generator=generator
-    ).float()
+    box.scatter_(1, torch.randint(3, (600, 1), generator=generator), (box[:, :1] > 0.5).float())
     with pytest.warns(tr.errors.FramesWarning, match="not surely found in frames 2 of 3, counted from 0"):
         found = tr.calibrate(plain_hand, [*clouds, 0.15 * box])
     assert (found.status, found.outliers) == (tr.Status.WITH_WARNINGS, (2,))
