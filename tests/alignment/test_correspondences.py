@@ -1,4 +1,4 @@
-"""SoftAssign and closest points, the rivals of the E-step: what they have in common, and what makes each of them."""
+"""The rules that match model points and data: what all have in common, and what makes each of them what it is."""
 
 import itertools
 import math
@@ -21,7 +21,8 @@ TRIM, MODEL_OUTLIER, OUTLIER_CONSTANT = 1.5, 0.01, 3 * math.sqrt(math.pi / 2)
 FIELDS = ("weights", "targets", "inlier_posterior", "squared_error")
 EXACT = {"sweeps": 20_000, "tolerance": 1e-13}
 
-every_rule = pytest.mark.parametrize("rule", [softassign, closest_point])
+every_rule = pytest.mark.parametrize("rule", [expectation, softassign, closest_point])
+every_rival = pytest.mark.parametrize("rule", [softassign, closest_point])
 both_precisions = pytest.mark.parametrize("dtype", [torch.float32, D])
 
 
@@ -101,7 +102,7 @@ def test_a_batch_is_a_loop_and_one_cloud_serves_many_poses(rule):
             torch.testing.assert_close(getattr(together, field)[b, k], getattr(alone, field))
 
 
-@every_rule
+@every_rival
 @both_precisions
 @pytest.mark.parametrize("far", [1e6, 1e25])
 def test_far_outliers_get_nothing_and_move_nothing(rule, dtype, far):
@@ -117,7 +118,7 @@ def test_far_outliers_get_nothing_and_move_nothing(rule, dtype, far):
     assert float(alone.squared_error) == 0
 
 
-@every_rule
+@every_rival
 @both_precisions
 @pytest.mark.parametrize("sigma", [1e-3, 1e-8, 1e-20, 1e-30])
 def test_sigma_may_vanish(rule, dtype, sigma):
