@@ -1,11 +1,10 @@
 """Gradients of a fitted person in the data: those of fitting again, and of moving everything."""
 
-import math
-
 import pytest
 import torch
 
 import torchreg as tr
+from tests.alignment.made import person_pose
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.rotation import so3_exp, so3_log
 
@@ -17,9 +16,7 @@ QUICK = tr.AlignConfig(num_model_points=150, search="never")
 def scanned(person):
     """A cloud of all sides of a person with little noise, its pose, and the fit to it with gradients."""
     generator = torch.Generator().manual_seed(0)
-    pose = person.rest_pose()
-    pose[6:] = math.radians(12) * torch.randn(len(pose) - 6, generator=generator)
-    pose[:6] = torch.tensor([0.3, -0.2, 0.9, 0.1, -0.1, 0.15])
+    pose = person_pose(person, generator)
     mesh = tr.TriangleMesh(person.vertices(pose, TRUTH), person.surface.faces)
     data = sample_surface(mesh, 700, generator=generator)[0]
     data = (data + 0.001 * torch.randn(data.shape, generator=generator)).requires_grad_()

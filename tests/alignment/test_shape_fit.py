@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.alignment.made import person_cloud, person_pose
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
@@ -18,18 +19,10 @@ QUICK = tr.AlignConfig(num_model_points=150, search="never")
 
 
 def scan(shape, coefficients, seed, *, one_sided=True, count=700):
-    """Points on what faces a camera at -y, with 2 mm noise and 5 % outliers, and their true pose."""
+    """A pose of a person and its cloud, with 2 mm noise and 5 % outliers."""
     generator = torch.Generator().manual_seed(seed)
-    pose = shape.rest_pose()
-    pose[6:] = math.radians(12) * torch.randn(len(pose) - 6, generator=generator)
-    pose[:6] = torch.tensor([0.3, -0.2, 0.9, 0.1, -0.1, 0.15])
-    mesh = tr.TriangleMesh(shape.vertices(pose, coefficients), shape.surface.faces)
-    points, face, _ = sample_surface(mesh, 4 * count, generator=generator)
-    faces_camera = mesh.face_normals()[face][:, 1] < -0.1
-    points = points[faces_camera] if one_sided else points
-    points = points[:count] + 0.002 * torch.randn(count, 3, generator=generator)
-    low, high = points.amin(0) - 0.2, points.amax(0) + 0.2
-    return pose, torch.cat([points, low + (high - low) * torch.rand(count // 20, 3, generator=generator)])
+    pose = person_pose(shape, generator)
+    return pose, person_cloud(shape, pose, coefficients, generator, count, one_sided=one_sided)
 
 
 def start_near(shape, pose):

@@ -56,12 +56,3 @@ def test_states_do_not_grow(tracker, frames, tracked):
     for state in (made.state, *tracked.states):
         assert len(state.points) <= 400
         assert len(state.unexplained) < 200
-
-
-def test_a_state_knows_whether_the_shape_was_found_and_fitted(tracker, frames):
-    assert not tracker(None).state.found
-    made = tracker()
-    assert made.state.found
-    assert not made.state.tracked
-    made.step(frames[0])
-    assert made.state.tracked
