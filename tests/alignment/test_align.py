@@ -8,7 +8,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.conftest import DESCENT
-from tests.alignment.made import D, cloud, generator, hinge, joint, machine, off, shape_of, solid
+from tests.alignment.made import cloud, generator, machine, off
 from torchreg.geometry.rotation import so3_exp
 
 
@@ -48,20 +48,6 @@ def test_one_side_with_outliers_gives_the_pose_and_the_inliers(plain_hand, plain
     # Some of the uniform clutter lies within the threshold of the true surface; no method can exclude it.
     clutter = ~measured.inliers & (plain_hand.distance(measured.points, truth).abs() > 0.006)
     assert int((result.inliers & clutter).sum()) <= 0.05 * int(result.inliers.sum())
-
-
-def test_double_precision_stays_double_precision(plain_hand_skin, clean, start, truth):
-    hand = tr.Hand(dtype=D).requires_grad_(False)
-    skin = tr.BendingSkin(hand, plain_hand_skin.points)
-    data, pose = clean.double(), start.double()
-    result = tr.align(hand, data, pose, model_points=skin, config=DESCENT)
-    for name in ("pose", "registered", "keypoints", "distances", "posterior", "sigma", "cost"):
-        assert getattr(result, name).dtype == D
-    assert float(off(hand, result.pose, truth.double()).mean()) < 0.001
-    assert torch.equal(data, clean.double())
-    assert torch.equal(pose, start.double())
-    # Data of another precision are taken in the shape's.
-    assert tr.align(hand, clean, start, model_points=skin, config=replace(DESCENT, em_steps=1)).pose.dtype == D
 
 
 # Symmetries
@@ -158,28 +144,6 @@ def test_history_is_what_was_called_back_stage_after_stage(found):
     torch.testing.assert_close(records[-1].pose[0], result.pose, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "schedule",
-    [
-        tr.SigmaSchedule.linear(0.02, 0.005, 4), tr.SigmaSchedule.constant(0.01, 2),
-        tr.SigmaSchedule.adaptive(0.02, 0.004, 6),
-    ],
-)  # fmt: skip
-def test_a_schedule_is_followed(plain_hand, fit, clean, start, found, truth, schedule):
-    """Without surface steps there is no surface fit."""
-    result = fit(clean, start, config=replace(DESCENT, schedule=schedule, surface_steps=0))
-    assert {(record.stage, record.num_steps) for record in result.history} == {("em", schedule.steps)}
-    used = [float(record.sigma) for record in result.history]
-    if schedule.kind == "fixed":
-        assert list(dict.fromkeys(used)) == pytest.approx(sorted(set(schedule.values), reverse=True))
-        assert float(result.sigma) == pytest.approx(used[-1])
-    else:
-        assert used[0] == pytest.approx(schedule.values[0])
-        assert schedule.values[1] * (1 - 1e-6) <= min(used) <= used[-1] < used[0]
-    assert float(off(plain_hand, result.pose, truth).mean()) < 0.8 * float(off(plain_hand, start, truth).mean())
-    assert float(result.distances.abs().mean()) > float(found[0].distances.abs().mean())
-
-
 # Options
 
 
@@ -233,30 +197,6 @@ def test_a_bolted_machine_with_a_slide_finds_its_joints(search):
     assert result.pose[0, 6:].tolist() == pytest.approx([0.31, 0.5], abs=0.02)
     assert float(result.inliers.float().mean()) > 0.9
     torch.testing.assert_close(result.pose[0], result.pose[1], rtol=0, atol=2e-3)
-
-
-def test_a_slide_that_mimics_the_one_of_the_other_arm_is_aligned():
-    """By half of it and 2 cm; one datum counts for both."""
-    joints = [joint("base", -1)]
-    for side, mimic in ((1, {"lower": 0.0, "upper": 0.15}), (-1, {"mimic": (3, 0.5, 0.02)})):
-        number = len(joints)
-        joints += [
-            joint(f"upper{side}", 0, (0.2 * side, 0, 0.05), *hinge((0.0, 1.0, 0.0))),
-            joint(f"fore{side}", number, (0, 0, 0.4), *hinge()),
-            joint(f"slide{side}", number + 1, (0, 0, 0.3), "prismatic", (0.0, 0.0, 1.0), **mimic),
-        ]
-    arm = [
-        solid("superquadric", (0.04, 0.03, 0.2, 0.4, 0.4), 0, 0, 0.2),
-        solid("ellipsoid", (0.03, 0.025, 0.15), 0, 0, 0.15), solid("ellipsoid", (0.06, 0.02, 0.02), 0, 0, 0.05),
-    ]  # fmt: skip
-    shape = shape_of(joints, [solid("ellipsoid", (0.15, 0.1, 0.05)), *arm, *arm])
-    truth = torch.tensor([0.1, 0.0, 0.5, 0.2, 0.1, -0.1, 0.4, -0.5, 0.08, -0.6, 0.3])
-    data = tr.sample_skin(shape, 500)(truth) + 0.002 * torch.randn(500, 3, generator=generator())
-    start = truth + 0.1 * torch.randn(11, generator=generator(1)) * ~shape.is_sliding
-    start[8] = 0.02
-    found = tr.align(shape, data, start, config=replace(DESCENT, num_model_points=300))
-    assert found.status is tr.Status.CONVERGED
-    assert float((found.pose - truth).abs().max()) < 0.01
 
 
 # Search

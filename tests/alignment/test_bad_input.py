@@ -69,15 +69,11 @@ def test_bad_clouds_and_masks(plain_hand, plain_hand_skin, function, name, mask_
 
 
 @pytest.mark.parametrize(("function", "name", "mask_name"), FUNCTIONS[:3])
-def test_what_is_no_cloud(plain_hand, plain_hand_skin, function, name, mask_name):
+def test_what_is_no_cloud_and_no_skin_of_the_shape(plain_hand, plain_hand_skin, function, name, mask_name):
     with pytest.raises(TYPE, match=f"{name} must be a tensor or an array of numbers, got str"):
         function(plain_hand, plain_hand_skin, "cloud.ply")
     with pytest.raises(TYPE, match=f"{mask_name} must be a tensor of bool"):
         function(plain_hand, plain_hand_skin, torch.zeros(4, 3), [True] * 4)
-
-
-@pytest.mark.parametrize("function", [align, find_pose, initialize])
-def test_a_skin_must_be_of_the_same_shape(plain_hand_skin, function):
     with pytest.raises(INPUT, match="model_points is a skin of another shape; build it from the shape"):
         function(tr.Hand(), plain_hand_skin, torch.zeros(4, 3))
 

@@ -102,17 +102,13 @@ def test_errors_that_all_frames_share_lie_within_the_ellipsoid(arm, clouds, scal
 OFF = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])
 
 
-@pytest.fixture(scope="module")
-def with_offsets(arm, clouds):
-    """Found from readings that are off; the first joint's offset turns the base alone but for the base's own link."""
-    return tr.calibrate_base(arm, clouds, JOINTS - OFF, offsets=True)
-
-
-def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(with_offsets):
-    assert with_offsets.status is tr.Status.CONVERGED
-    assert errors(with_offsets.T_camera_base)[0] < 0.003
-    assert math.degrees(float((with_offsets.offsets - OFF)[:2].abs().max())) < 0.2
-    assert float(with_offsets.offset_std[1]) > 0
+def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(arm, clouds):
+    """The first joint's offset turns the base alone but for the base's own link."""
+    found = tr.calibrate_base(arm, clouds, JOINTS - OFF, offsets=True)
+    assert found.status is tr.Status.CONVERGED
+    assert errors(found.T_camera_base)[0] < 0.003
+    assert math.degrees(float((found.offsets - OFF)[:2].abs().max())) < 0.2
+    assert float(found.offset_std[1]) > 0
 
 
 def test_clouds_without_the_robot_are_told(arm):

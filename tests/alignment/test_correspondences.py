@@ -104,27 +104,11 @@ def test_a_batch_is_a_loop_and_one_cloud_serves_many_poses(rule):
 
 @every_rival
 @both_precisions
-@pytest.mark.parametrize("far", [1e6, 1e25])
-def test_far_outliers_get_nothing_and_move_nothing(rule, dtype, far):
-    model, data, sigma = cloud(30, dtype=dtype), cloud(30, seed=1, dtype=dtype), scalar(0.1, dtype)
-    plain = rule(model, data, sigma)
-    cluttered = rule(model, torch.cat([data, far + cloud(3, dtype=dtype)]), sigma)
-    assert cluttered.inlier_posterior[30:].tolist() == [0, 0, 0]
-    for field in ("weights", "targets", "squared_error"):
-        torch.testing.assert_close(getattr(cluttered, field), getattr(plain, field))
-    alone = rule(model, far + cloud(3, dtype=dtype), sigma)
-    assert alone.weights.tolist() == [0] * 30
-    assert torch.equal(alone.targets, model)
-    assert float(alone.squared_error) == 0
-
-
-@every_rival
-@both_precisions
 @pytest.mark.parametrize("sigma", [1e-3, 1e-8, 1e-20, 1e-30])
 def test_sigma_may_vanish(rule, dtype, sigma):
     """Points that coincide match, with certainty or as one pair does; everything else is an outlier for certain."""
     model = cloud(40, dtype=dtype)
-    data = torch.cat([model[:5], cloud(30, seed=1, dtype=dtype) + 3])
+    data = torch.cat([model[:5], cloud(15, seed=1, dtype=dtype) + 3, cloud(15, seed=2, dtype=dtype) + 1e25])
     matches = rule(model, data, scalar(sigma, dtype), **(EXACT if rule is softassign else {}))
     torch.testing.assert_close(matches.targets, model)
     assert matches.inlier_posterior[5:].tolist() == [0] * 30

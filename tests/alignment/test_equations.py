@@ -7,7 +7,7 @@ import torchreg as tr
 from tests.alignment.made import D
 from torchreg.alignment.fit.objectives import GaussianPosePrior, distance_objective, registration_objective
 from torchreg.shapes.surface import FusedSurface
-from torchreg.solvers.e_step import EStep, expectation
+from torchreg.solvers.e_step import expectation
 from torchreg.solvers.levenberg_marquardt import Linearization
 
 SIGMA = torch.tensor([0.03, 0.05], dtype=D)
@@ -114,21 +114,6 @@ def test_gradients_and_costs_alone_are_those_of_the_cost(links, request, name, s
     expected = differences(links, lambda trial: objective(trial).cost, pose, step)
     torch.testing.assert_close(objective(pose).gradient, expected, rtol=1e-5, atol=1e-4)
     torch.testing.assert_close(objective.cost(pose), objective(pose).cost, rtol=1e-12, atol=0)
-
-
-def test_model_points_without_data_and_padding_do_not_count(skin, matches, surface_fit):
-    kept = torch.arange(40) % 2 == 1
-    weights, targets = matches.weights * kept, torch.where(kept[:, None], matches.targets, 1e3)
-    few, none = (
-        EStep(weights + least * ~kept, places, matches.inlier_posterior, matches.squared_error)
-        for least, places in ((1e-13, targets), (0.0, matches.targets))
-    )
-    moved = surface_fit.data.data.clone()
-    moved[1, 30:] += 5.0
-    padded = distance_objective(surface_fit.data.surface, moved, surface_fit.data.valid, WIDTHS, NOISE, PRIOR)
-    torch.testing.assert_close(padded(poses()), surface_fit(poses()))
-    few, none = (registration_objective(skin, each, SIGMA, NO_PRIOR)(poses()) for each in (few, none))
-    torch.testing.assert_close(few, none)
 
 
 @pytest.mark.parametrize("prior", [PRIOR, PRIOR_OF_EACH], ids=["all", "each"])

@@ -144,16 +144,6 @@ def test_joints_that_no_data_determine_are_named_whatever_the_status(tmp_path, s
     assert held.dof_confidence[-1] > 0.99
 
 
-def test_a_batch_names_deviations_as_it_names_poses_and_what_is_seen_is_determined(plain_hand, plain_hand_skin):
-    pose = plain_hand.rest_pose().expand(2, -1)
-    found = tr.align(plain_hand, plain_hand_skin(pose) + noise_of(2, 400), pose, config=DESCENT)
-    assert not any("determined" in doubt for doubt in found.doubt)
-    assert list(found.named_std) == list(found.named_pose)
-    assert found.named_std["little_dip_flexion"].shape == (2,)
-    assert found.dof_confidence.shape == (2, plain_hand.num_dofs)
-    assert bool((found.dof_confidence > 0.5).all())
-
-
 def test_the_more_fingers_are_without_data_the_lower_is_the_confidence(plain_hand, plain_hand_skin):
     pose, part = plain_hand.rest_pose(), plain_hand_skin.weights.argmax(-1)
     pose[3:6], pose[6:] = torch.tensor([2.9, 0.3, -0.4]), 0.2 * plain_hand.upper[6:].clamp_min(0)
@@ -165,7 +155,10 @@ def test_the_more_fingers_are_without_data_the_lower_is_the_confidence(plain_han
     assert bool((found.confidence.diff() < 0).all())
     assert found.confidence[0] > 0.9
     assert "hardly any data show where thumb, index end" in found.doubt[2]
-    assert "hardly any data" not in found.doubt[0]
+    assert not any(words in found.doubt[0] for words in ("hardly any data", "determined"))
+    assert list(found.named_std) == list(found.named_pose)
+    assert found.named_std["little_dip_flexion"].shape == (4,)
+    assert bool((found.dof_confidence[0] > 0.5).all())
     # A tighter prior knows more of what is hidden, and clouds of a batch are each as alone.
     tight = tr.align(plain_hand, clouds[3], pose, mask=mask[3], model_points=plain_hand_skin,
                      config=tr.AlignConfig(search="never", prior_std=0.03))  # fmt: skip

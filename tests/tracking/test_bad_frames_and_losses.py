@@ -1,6 +1,5 @@
 """Frames that show no shape are named; a shape that is doubtful, lost or unknown is searched, ever more rarely."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -45,13 +44,6 @@ def test_a_hand_that_leaps_out_of_reach_is_proposed_by_the_network_at_once(tip_e
 
 def moved(pose, x):
     return torch.cat([pose[:1] + x, pose[1:]])
-
-
-def test_without_a_pose_the_first_frame_is_found(tip_errors, tracker, clouds, frames, find, truths):
-    find(truths[:1] + 0.004, [10.0])
-    result = tracker(None).run(frames[:3])
-    assert result.acquired == ("found", "tracked", "tracked")
-    assert tip_errors(result.keypoints[1:], clouds[1:3]).mean() < 0.006
 
 
 def test_a_wrong_pose_that_was_found_is_corrected_in_the_next_frame(
@@ -119,33 +111,6 @@ def test_what_was_doubtful_in_all_frames_is_forgotten_when_it_is_gone(plain_hand
     assert [record.status for record in records[:2]] == [tr.Status.DOUBTFUL, tr.Status.DOUBTFUL]
     assert [record.acquired for record in records[2:]] == ["found", "tracked"]
     assert (plain_hand.keypoints(records[2].pose) - plain_hand.keypoints(truths[2])).norm(dim=-1).mean() < 0.005
-
-
-def test_a_lost_hand_is_found_where_it_is_nearest(plain_hand, noise_frame, truths, frames, tracker, tracked, find):
-    """The hand vanishes for frames and comes back far away; of equally good poses the one near the last is taken."""
-    calls = find(torch.stack([moved(truths[5], 0.3), truths[5], truths[5]]), [10.0, 11.0, 300.0])
-    made = tracker(state=replace(tracked.states[4], pose=moved(tracked.states[4].pose, -0.4)))
-    records = [made.step(noise_frame(seed=k)) for k in range(3)]
-    assert {record.status for record in records} == {tr.Status.LOST}
-    assert calls == []
-    records = [made.step(frames[5]) for _ in range(9)]
-    first = next(record for record in records if record.status.usable)
-    assert first.acquired == "found"
-    assert (first.keypoints - plain_hand.keypoints(truths[5])).norm(dim=-1).mean() < 0.005
-    assert len(calls) >= 1
-
-
-def test_fingers_that_were_missed_are_repaired_within_frames(plain_hand, tip_errors, clouds, frames, tracker, tracked):
-    """With two fingers far off their data the evidence drops, and limbs are placed anew."""
-    wrong = tracked.states[4].pose.clone()
-    for name in ("index_mcp_flexion", "middle_mcp_flexion"):
-        wrong[plain_hand.dof_names.index(name)] += 1.0
-    state = replace(tracked.states[4], pose=plain_hand.clamp(wrong))
-    made = tracker(state=state)
-    records = [made.step(frames[number]) for number in (5, 6, 7)]
-    assert {record.acquired for record in records} & {"surface", "starts", "search"}
-    assert tip_errors(records[2].keypoints[None], clouds[7:8]).mean() < 0.004
-    assert tracker(state=state, recovery="none").step(frames[5]).acquired in ("tracked", "lost")
 
 
 def test_a_flipped_base_is_among_the_starts(plain_hand_skin, truths):

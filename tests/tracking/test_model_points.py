@@ -37,16 +37,6 @@ def test_seen_points_are_those_near_data_and_occluded_ones_are_kept(tracking):
     }
 
 
-def test_seen_points_face_the_camera(plain_hand_skin, tracked):
-    """The camera stands at the origin: most of what is kept of well-seen parts faces it."""
-    state = tracked.states[-1]
-    index = torch.cdist(state.points, plain_hand_skin.points).argmin(-1)
-    parts = plain_hand_skin.weights.argmax(-1)
-    on_palm = parts[index] == 0
-    towards = -(plain_hand_skin(state.pose) * plain_hand_skin.posed_normals(state.pose)).sum(-1) > 0
-    assert towards[index][on_palm].float().mean() > 0.8 > 0.6 > towards[parts == 0].float().mean()
-
-
 def test_parts_that_no_data_show_keep_their_points_or_take_those_of_the_shape(arm, tracking):
     body = arm.distance(tracking.cloud, tracking.pose, parts=[1]) > 0.03
     _, state = after(tracking, tracking.cloud[body])
