@@ -1,7 +1,6 @@
 """Shapes and data that several tests make: trees of solids by a line a joint, poses, clouds, problems."""
 
 import math
-from dataclasses import replace
 
 import torch
 
@@ -113,10 +112,3 @@ def problem_of(skin, data, pose, valid=None, origin=None, prior_std=0.4, **optio
     valid = torch.ones_like(data[..., 0], dtype=torch.bool) if valid is None else valid
     origin = torch.zeros_like(data[:, 0]) if origin is None else origin
     return centered_problem(skin, data, valid, pose, origin, **({"prior_std": prior_std, "pose_atol": 0.0} | options))
-
-
-def make_problem(skin, data, **options):
-    """Return a problem of data (B, M, 3) in their own coordinates, without a prior, with some fields replaced."""
-    return replace(
-        problem_of(skin, data, skin.shape.rest.repeat(len(data), 1), prior_std=None, pose_atol=1e-6), **options
-    )

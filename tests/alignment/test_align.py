@@ -50,9 +50,6 @@ def test_one_side_with_outliers_gives_the_pose_and_the_inliers(plain_hand, plain
     assert int((result.inliers & clutter).sum()) <= 0.05 * int(result.inliers.sum())
 
 
-# Symmetries
-
-
 def test_a_batch_is_a_loop(plain_hand, plain_hand_surface, fit, start, truth):
     """Three clouds of different sizes, padded with a mask."""
     poses = truth.repeat(3, 1)
@@ -127,9 +124,6 @@ def test_several_starts_give_the_best(plain_hand, fit, clean, start, found, trut
     torch.testing.assert_close(result.cost, found[0].cost, rtol=0.02, atol=0.1)
 
 
-# Records and schedules
-
-
 def test_history_is_what_was_called_back_stage_after_stage(found):
     result, records = found
     assert list(result.history) == records
@@ -142,9 +136,6 @@ def test_history_is_what_was_called_back_stage_after_stage(found):
         assert widths == sorted(widths, reverse=True)
     assert float(records[-1].pose_change.max()) < 0.05
     torch.testing.assert_close(records[-1].pose[0], result.pose, rtol=0, atol=1e-6)
-
-
-# Options
 
 
 @pytest.mark.parametrize(
@@ -199,9 +190,6 @@ def test_a_bolted_machine_with_a_slide_finds_its_joints(search):
     torch.testing.assert_close(result.pose[0], result.pose[1], rtol=0, atol=2e-3)
 
 
-# Search
-
-
 def test_a_search_depends_on_its_seed_only(plain_hand, fit, clean, truth):
     config = tr.AlignConfig(search="always", num_candidates=6, search_rounds=1, seed=3)
     closed, index = truth.clone(), plain_hand.dof_names.index("index_mcp_flexion")
@@ -223,9 +211,6 @@ def test_an_alignment_is_no_worse_than_the_start_that_was_found(plain_hand, plai
     points = cloud(plain_hand, pose, 24, num_points=500, outlier_ratio=0.15, camera=torch.zeros(3)).points
     result, starts = fit(points, config=None), tr.find_pose(plain_hand, points, model_points=plain_hand_skin)
     assert result.cost <= starts.costs[0] + 1.0
-
-
-# Bad data
 
 
 @pytest.mark.parametrize("search", ["never", "auto"])

@@ -43,9 +43,6 @@ def clouds_with(value):
     return clouds
 
 
-# Every function that takes clouds
-
-
 @pytest.mark.parametrize(("function", "name", "mask_name"), FUNCTIONS)
 @pytest.mark.parametrize(
     ("clouds", "mask", "error", "message"),
@@ -91,8 +88,6 @@ def test_other_units_are_warned_of(plain_hand, plain_hand_skin, function, scale)
     function(plain_hand, plain_hand_skin, 10 * data, **start)
     function(plain_hand, plain_hand_skin, scale * data[:5], **start)
 
-
-# Single functions
 
 CHAIN = tr.Skeleton(torch.eye(3)[:2], torch.tensor([[0, 1]]), torch.ones(2))
 POINT = tr.Skeleton(torch.zeros(1, 3), torch.zeros(0, 2).long(), torch.ones(1))
@@ -220,9 +215,6 @@ def given(plain_hand, plain_hand_skin, links, person, tmp_path_factory):
 def test_bad_arguments(given, call, error, message):
     with pytest.raises(error, match=message):
         call(given)
-
-
-# Settings
 
 
 @pytest.mark.parametrize(

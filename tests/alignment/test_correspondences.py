@@ -43,9 +43,6 @@ def assert_same(found, expected, **tolerance):
         torch.testing.assert_close(getattr(found, field), getattr(expected, field), **tolerance)
 
 
-# Every rule
-
-
 @every_rule
 @pytest.mark.parametrize("sigma", [0.1, 0.15])
 def test_masking_is_removing(rule, sigma):
@@ -122,9 +119,6 @@ def test_sigma_may_vanish(rule, dtype, sigma):
         torch.testing.assert_close(share / (1 - share).square(), expected, rtol=1e-4, atol=0)
 
 
-# Closest points
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.floats(0.005, 0.5), st.integers(0, 1000))
 def test_closest_points_are_those_of_a_tree(n, m, sigma, seed):
@@ -147,9 +141,6 @@ def test_memory_does_not_change_the_answer(monkeypatch, entries):
     at_once = closest_point(model, data, sigma, mask=some_mask(3, 9))
     monkeypatch.setattr(e_step, "BUDGET", replace(e_step.BUDGET, table_entries=entries))
     assert_same(closest_point(model, data, sigma, mask=some_mask(3, 9)), at_once)
-
-
-# SoftAssign
 
 
 def as_printed(model, data, sigma, b, c, sweeps=3000):

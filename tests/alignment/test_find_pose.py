@@ -93,9 +93,6 @@ def test_the_seed_decides_and_the_global_state_does_not(find, two_clouds):
     assert not torch.equal(first.poses, other.poses)
 
 
-# Sources
-
-
 def test_sources_may_be_of_ones_own(plain_hand, find, two_clouds, two_hands):
     """One that knows roughly how a hand is held; it is asked once, in the coordinates of the problem's data."""
     asked = []
@@ -159,9 +156,6 @@ def test_upright_rotations_turn_about_the_vertical_alone(plain_hand, plain_hand_
     assert float(off(plain_hand, found.best, truth)[TIPS].mean()) < 0.005
 
 
-# Other shapes
-
-
 FREE = ("revolute", (1.0, 0.0, 0.0))
 ROOM = {
     "a bolted machine": (machine(free_base=False), [[0, 0, 0, 0, 0, 0, 0.41, 1.1], [0, 0, 0, 0, 0, 0, 0.07, -0.8]]),
@@ -207,9 +201,6 @@ def test_skinned_rigs_are_found_in_any_rotation_and_alone_as_in_a_batch(person):
     assert bool((error < 0.02 * (rest.amax(0) - rest.amin(0)).norm()).all())
     alone = tr.find_pose(person, data[1], config=config).poses[0]
     torch.testing.assert_close(person.vertices(alone), person.vertices(both[1]), rtol=0, atol=1e-3)
-
-
-# Doubt
 
 
 @pytest.mark.parametrize("num_searched", [2, 3])

@@ -30,9 +30,6 @@ def placed(shape, data, mean, std=2.0, **options):
     return found
 
 
-# Hands
-
-
 @pytest.fixture(scope="module")
 def truths(plain_hand):
     """Two hands, turned, every finger bent by its own share of its range."""
@@ -72,18 +69,6 @@ def test_a_hidden_finger_stays_near_the_mean_of_the_prior(plain_hand, plain_hand
     assert float((found - start)[:, is_little].abs().max()) < 0.4
     assert float(off(plain_hand, found, truths)[:, TIPS[:4]].mean()) < 0.004
 
-
-def test_a_batch_is_a_loop_and_padding_where_fingers_might_be_changes_nothing(
-    plain_hand, plain_hand_skin, hands, stretched
-):
-    padded = torch.cat([hands[0], plain_hand_skin(stretched)[:, :100]], dim=1)
-    for row in range(2):
-        mask = torch.arange(500) < 400
-        alone = placed(plain_hand, padded[row], stretched[row], 1.0, mask=mask, model_points=plain_hand_skin)
-        assert float(off(plain_hand, alone, hands[1][row]).max()) < 2e-3
-
-
-# Other shapes
 
 FREE_ARM = [joint("plate", -1), *[joint(str(k), k, (0, 0.05, 0.2 if k else 0.05), "revolute", (0.0, 1.0, 0.0))
                                   for k in range(3)]]  # fmt: skip

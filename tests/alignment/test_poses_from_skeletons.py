@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.alignment.made import TIPS, make_problem, off
+from tests.alignment.made import TIPS, off, problem_of
 from torchreg.geometry.skeleton import build_skeleton
 
 
@@ -48,7 +48,8 @@ def test_a_batch_of_clouds_shares_the_skeleton(plain_hand, plain_hand_skin, plai
     cloud = plain_hand_surface(pose)[::7]
     origin = torch.stack([cloud.mean(0), cloud[200:].mean(0) + 0.1])
     source = tr.SpineLimbs(hand_skeleton(plain_hand, pose), count=1)
-    problem = make_problem(plain_hand_skin, cloud[:400] - origin[:, None], origin=origin)
+    rest = plain_hand.rest_pose().repeat(2, 1)
+    problem = problem_of(plain_hand_skin, cloud[:400].expand(2, -1, -1), rest, origin=origin)
     poses = source(problem, torch.Generator())
     assert poses.shape == (2, 1, plain_hand.num_dofs)
     for row, middle in zip(poses[:, 0], origin, strict=True):

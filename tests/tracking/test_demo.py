@@ -45,26 +45,21 @@ def test_the_hand_is_found_and_followed(three):
         assert 0.6 < share < 0.8
 
 
-def stop_at(monkeypatch, frame):
-    """Let the keyboard interrupt the tracker while it works on a frame."""
-    step = tr.Tracker.step
+def test_an_interruption_keeps_the_frames_that_are_done(monkeypatch):
+    """The keyboard interrupts the tracker while it works on the third frame; before the first, nothing is kept."""
+    step, stop = tr.Tracker.step, 2
 
     def stopped(self, points, time=None, **keypoints):
-        if self.state.frame == frame:
+        if self.state.frame == stop:
             raise KeyboardInterrupt
         return step(self, points, time)
 
     monkeypatch.setattr(tr.Tracker, "step", stopped)
-
-
-def test_an_interruption_keeps_the_frames_that_are_done(monkeypatch):
-    stop_at(monkeypatch, 2)
     result = demo.run_demo(4, config=tr.TrackConfig(recovery="none"))
     assert len(result.track.poses) == len(result.truths) == len(result.clouds) == len(result.inliers) == 2
     # Without a search nothing is found.
     assert not result.track.poses.isfinite().any()
     assert result.tip_errors.isnan().all()
-    # Before the first frame there is nothing to keep.
-    stop_at(monkeypatch, 0)
+    stop = 0
     with pytest.raises(KeyboardInterrupt):
         demo.run_demo(2)

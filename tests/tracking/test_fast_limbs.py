@@ -7,7 +7,6 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import joint, shape_of, solid
-from torchreg.tracking.limb_combination import scatter_joints
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +38,3 @@ def test_every_limb_is_found_at_its_own_pace(crab, paces):
     torch.testing.assert_close(found.pose[:3], truth[:3], atol=0.004, rtol=0)
     tracker.state = state
     assert torch.equal(tracker.step(skin(truth)).pose, found.pose)
-
-
-def test_joints_are_scattered_and_the_base_is_not():
-    pose = torch.arange(8.0)[None]
-    poses = scatter_joints(pose, torch.tensor([0.1, 0.4]), 4000, torch.Generator().manual_seed(0))
-    assert torch.equal(poses[:, :6], pose[:, :6].expand(4000, -1))
-    torch.testing.assert_close(poses[:, 6:].mean(0), pose[0, 6:], atol=0.02, rtol=0)
-    torch.testing.assert_close(poses[:, 6:].std(0), torch.tensor([0.1, 0.4]), atol=0.01, rtol=0)
