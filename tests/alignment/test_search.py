@@ -39,9 +39,12 @@ def searched(plain_hand, plain_hand_skin, fit):
     truths = truth.repeat(7, 1)
     truths[:, 0] += apart
     result = fit(data, starts, mask=mask, config=CONFIG)
-    # The last fit after a search has two widths.
-    around = [record.pose[:, 0] for record in result.history if (record.stage, record.num_steps) == ("surface", 2)]
-    return result, truths, {round(float(place)) for place in torch.cat(around)}
+    return result, truths, {round(float(place)) for place in torch.cat(poses_searched(result))[:, 0]}
+
+
+def poses_searched(result):
+    """Return the poses of each last fit after a search, which has two widths."""
+    return [record.pose for record in result.history if (record.stage, record.num_steps) == ("surface", 2)]
 
 
 def test_a_descent_that_went_far_or_leaves_a_finger_off_the_surface_is_not_trusted(searched):
@@ -54,3 +57,14 @@ def test_what_was_lost_is_found(plain_hand, searched):
     assert errors.tolist() == pytest.approx([0] * 7, abs=0.005)
     assert bool(((result.pose >= plain_hand.lower) & (result.pose <= plain_hand.upper)).all())
     assert all(status.usable for status in result.statuses)
+
+
+def test_clusters_of_data_without_a_finger_are_searched_though_nothing_moved(plain_hand, plain_hand_skin, fit):
+    """A finger that is held away from its data."""
+    truth = plain_hand.rest_pose()
+    start, points = truth.clone(), plain_hand_skin(truth)
+    little = [name for name in plain_hand.dof_names if name.startswith("little")]
+    start[[plain_hand.dof_names.index(name) for name in little[1:]]] = torch.tensor([1.2, 1.2, 0.8])
+    config = tr.AlignConfig(num_candidates=2, search_rounds=1)
+    assert poses_searched(fit(points, start, locked=little, config=config))
+    assert not poses_searched(fit(points, truth, locked=little, config=config))
