@@ -50,7 +50,7 @@ def test_states_of_the_first_release_are_read_under_the_new_names():
 
 def test_states_do_not_grow(tracker, frames, tracked):
     made = tracker()
-    for k in range(45):
+    for k in range(31):
         made.step(frames[min(k % 14, 14 - k % 14)])
     assert made.state.keyframes.shape == (3, 27)
     for state in (made.state, *tracked.states):
