@@ -1,6 +1,6 @@
 """Shapes and data that several tests make: trees of solids by a line a joint, poses, clouds, problems."""
 
-from dataclasses import replace
+import math
 
 import torch
 
@@ -8,6 +8,7 @@ import torchreg as tr
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.datasets.hand import make_hand_cloud
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.mesh import sample_surface
 from torchreg.shapes.primitives import Primitive
 
 D = torch.float64
@@ -83,6 +84,24 @@ def cloud(hand, pose, seed=0, **options):
     return make_hand_cloud(hand, pose, generator=generator(seed), **options)
 
 
+def person_cloud(shape, pose, coefficients, generator, count, *, one_sided=True, noise=0.002):
+    """Return points of a person on what faces a camera at -y, or all sides, with noise and 5 % outliers."""
+    mesh = tr.TriangleMesh(shape.vertices(pose, coefficients), shape.surface.faces)
+    points, face, _ = sample_surface(mesh, 4 * count, generator=generator)
+    points = points[mesh.face_normals()[face][:, 1] < -0.1] if one_sided else points
+    points = points[:count] + noise * torch.randn(count, 3, generator=generator)
+    low, high = points.amin(0) - 0.2, points.amax(0) + 0.2
+    return torch.cat([points, low + (high - low) * torch.rand(count // 20, 3, generator=generator)])
+
+
+def person_pose(shape, generator):
+    """Return a pose of a person a metre away whose limbs are bent by some 12 degrees."""
+    pose = shape.rest_pose()
+    pose[6:] = math.radians(12) * torch.randn(len(pose) - 6, generator=generator)
+    pose[:6] = torch.tensor([0.3, -0.2, 0.9, 0.1, -0.1, 0.15])
+    return pose
+
+
 def off(shape, poses, truths):
     """Return the distances of the keypoints from their true places."""
     return (shape.keypoints(poses) - shape.keypoints(truths)).norm(dim=-1)
@@ -93,10 +112,3 @@ def problem_of(skin, data, pose, valid=None, origin=None, prior_std=0.4, **optio
     valid = torch.ones_like(data[..., 0], dtype=torch.bool) if valid is None else valid
     origin = torch.zeros_like(data[:, 0]) if origin is None else origin
     return centered_problem(skin, data, valid, pose, origin, **({"prior_std": prior_std, "pose_atol": 0.0} | options))
-
-
-def make_problem(skin, data, **options):
-    """Return a problem of data (B, M, 3) in their own coordinates, without a prior, with some fields replaced."""
-    return replace(
-        problem_of(skin, data, skin.shape.rest.repeat(len(data), 1), prior_std=None, pose_atol=1e-6), **options
-    )

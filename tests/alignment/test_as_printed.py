@@ -8,11 +8,12 @@ import torch
 
 import torchreg as tr
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose
+from torchreg.datasets.sequences import hand_sequence
 
 
 @pytest.fixture(scope="module")
-def scene():
-    hand = tr.Hand().requires_grad_(False)
+def scene(plain_hand):
+    hand = plain_hand
     pose = random_hand_pose(hand, torch.Generator().manual_seed(0))
     cloud = make_hand_cloud(hand, pose, num_points=400, noise=0.001, outlier_ratio=0.2, generator=torch.Generator())
     start = hand.clamp(pose + torch.cat([torch.zeros(6), torch.full((hand.num_dofs - 6,), math.radians(8))]))
@@ -35,17 +36,6 @@ def test_the_printed_alignment_finds_a_hand_near_its_start(scene):
     assert ratios == pytest.approx([ratios[0]] * 4)
 
 
-def test_the_printed_constants_and_changes_of_them():
-    config = tr.AlignConfig.paper(seed=3)
-    assert (config.inlier_distance, config.debias, config.prior_std, config.search, config.seed) == (
-        0.005, 0.0, None, "never", 3,
-    )  # fmt: skip
-    track = tr.TrackConfig.paper(num_model_points=300)
-    assert (track.model_points, track.prediction, track.recovery, track.num_model_points) == (
-        "data", "none", "none", 300,
-    )  # fmt: skip
-
-
 def test_c_may_be_given_as_a_number(scene):
     hand, _, cloud, start = scene
     poses = {
@@ -57,12 +47,9 @@ def test_c_may_be_given_as_a_number(scene):
     assert not torch.allclose(limit, other, atol=1e-5)
 
 
-def test_the_printed_tracker_follows_slow_fingers():
-    from torchreg.datasets.sequences import hand_sequence
-
-    hand = tr.Hand().requires_grad_(False)
-    clouds = hand_sequence("bending_palm", 6, 20.0, shape=hand, seed=0)
-    tracker = tr.Tracker(hand, clouds[0].pose, config=tr.TrackConfig.paper())
+def test_the_printed_tracker_follows_slow_fingers(plain_hand):
+    clouds = hand_sequence("bending_palm", 6, 20.0, shape=plain_hand, seed=0)
+    tracker = tr.Tracker(plain_hand, clouds[0].pose, config=tr.TrackConfig.paper())
     for cloud in clouds[1:]:
         result = tracker.step(cloud.points)
-    assert tip_error(hand, result.pose, clouds[-1].pose) < 0.006
+    assert tip_error(plain_hand, result.pose, clouds[-1].pose) < 0.006

@@ -33,21 +33,14 @@ def calibrate(hand, skin, clouds, mask=None, **options):
     return tr.calibrate(hand, clouds, masks=mask, config=tr.CalibrateConfig(align=DESCENT), **options)
 
 
-FUNCTIONS = [
-    (align, "data", "mask"),
-    (find_pose, "data", "mask"),
-    (initialize, "points", "mask"),
-    (calibrate, "frames", "masks"),
-]
+NAMES = ("data", "mask"), ("data", "mask"), ("points", "mask"), ("frames", "masks")
+FUNCTIONS = [(call, *names) for call, names in zip((align, find_pose, initialize, calibrate), NAMES, strict=True)]
 
 
 def clouds_with(value):
     clouds = torch.zeros(2, 20, 3)
     clouds[0, :3, 1] = value
     return clouds
-
-
-# Every function that takes clouds
 
 
 @pytest.mark.parametrize(("function", "name", "mask_name"), FUNCTIONS)
@@ -58,42 +51,12 @@ def clouds_with(value):
         (torch.zeros(2, 0, 3), None, INPUT, r"NAME must hold at least one point, got shape \(2, 0, 3\)"),
         (torch.zeros(2, 5, 2), None, INPUT, r"NAME must have shape \(.*, M, 3\), got \(2, 5, 2\)"),
         (torch.zeros(3), None, INPUT, r"NAME must have shape \(.*M, 3\), got \(3,\)"),
-        (
-            torch.zeros(2, 5, 3) > 0,
-            None,
-            TYPE,
-            r"NAME must hold real numbers, got dtype torch\.bool",
-        ),
-        (
-            clouds_with(math.nan),
-            None,
-            INPUT,
-            "NAME hold 3 points that are not finite; drop them or set .*omit",
-        ),
-        (
-            clouds_with(math.inf),
-            None,
-            INPUT,
-            "NAME hold 3 points that are not finite; drop them or set .*omit",
-        ),
-        (
-            clouds_with(0),
-            torch.ones(2, 20),
-            TYPE,
-            "MASK must be a tensor of bool, False where NAME are",
-        ),
-        (
-            clouds_with(0),
-            torch.ones(20) > 0,
-            INPUT,
-            r"MASK must have shape \(2, 20\) like the NAME, got \(20,\)",
-        ),
-        (
-            clouds_with(0),
-            torch.ones(2, 20) < 0,
-            INPUT,
-            "NAME hold no point that is finite and not masked",
-        ),
+        (torch.zeros(2, 5, 3) > 0, None, TYPE, r"NAME must hold real numbers, got dtype torch\.bool"),
+        (clouds_with(math.nan), None, INPUT, "NAME hold 3 points that are not finite; drop them or set .*omit"),
+        (clouds_with(math.inf), None, INPUT, "NAME hold 3 points that are not finite; drop them or set .*omit"),
+        (clouds_with(0), torch.ones(2, 20), TYPE, "MASK must be a tensor of bool, False where NAME are"),
+        (clouds_with(0), torch.ones(20) > 0, INPUT, r"MASK must have shape \(2, 20\) like the NAME, got \(20,\)"),
+        (clouds_with(0), torch.ones(2, 20) < 0, INPUT, "NAME hold no point that is finite and not masked"),
     ],
 )
 def test_bad_clouds_and_masks(plain_hand, plain_hand_skin, function, name, mask_name, clouds, mask, error, message):
@@ -103,15 +66,11 @@ def test_bad_clouds_and_masks(plain_hand, plain_hand_skin, function, name, mask_
 
 
 @pytest.mark.parametrize(("function", "name", "mask_name"), FUNCTIONS[:3])
-def test_what_is_no_cloud(plain_hand, plain_hand_skin, function, name, mask_name):
+def test_what_is_no_cloud_and_no_skin_of_the_shape(plain_hand, plain_hand_skin, function, name, mask_name):
     with pytest.raises(TYPE, match=f"{name} must be a tensor or an array of numbers, got str"):
         function(plain_hand, plain_hand_skin, "cloud.ply")
     with pytest.raises(TYPE, match=f"{mask_name} must be a tensor of bool"):
         function(plain_hand, plain_hand_skin, torch.zeros(4, 3), [True] * 4)
-
-
-@pytest.mark.parametrize("function", [align, find_pose, initialize])
-def test_a_skin_must_be_of_the_same_shape(plain_hand_skin, function):
     with pytest.raises(INPUT, match="model_points is a skin of another shape; build it from the shape"):
         function(tr.Hand(), plain_hand_skin, torch.zeros(4, 3))
 
@@ -129,8 +88,6 @@ def test_other_units_are_warned_of(plain_hand, plain_hand_skin, function, scale)
     function(plain_hand, plain_hand_skin, 10 * data, **start)
     function(plain_hand, plain_hand_skin, scale * data[:5], **start)
 
-
-# Single functions
 
 CHAIN = tr.Skeleton(torch.eye(3)[:2], torch.tensor([[0, 1]]), torch.ones(2))
 POINT = tr.Skeleton(torch.zeros(1, 3), torch.zeros(0, 2).long(), torch.ones(1))
@@ -253,74 +210,37 @@ def given(plain_hand, plain_hand_skin, links, person, tmp_path_factory):
         (lambda g: tr.EMLoss(0.1)(CLOUD, CLOUD, torch.ones(5)), TYPE, "mask must be boolean, got dtype"),
         (lambda g: tr.EMLoss(0.1)(CLOUD, CLOUD, torch.ones(4) > 0), INPUT, r"mask must have shape \(\.\.\., 5\), got"),
         (lambda g: tr.EMLoss(0.1).virtual_observations(FRAMES, torch.zeros(3, 5, 3)), INPUT, "must broadcast"),
+        # Settings
+        (lambda g: tr.AlignConfig(search="often"), INPUT, "search must be one of auto, always, never; got 'often'"),
+        (lambda g: tr.AlignConfig(correspondence="icp"), INPUT, "correspondence must be one of em, softassign"),
+        (lambda g: tr.AlignConfig(outlier="none"), INPUT, "outlier must be one of limit, volume"),
+        (lambda g: tr.AlignConfig(nan_policy="drop"), INPUT, "nan_policy must be one of raise, omit"),
+        (lambda g: tr.AlignConfig(upright=(0, 1)), INPUT, "upright must have shape"),
+        (lambda g: tr.AlignConfig(upright=(0, 0, 0)), INPUT, "upright must be a direction, got zeros"),
+        (lambda g: tr.FindPoseConfig(upright=(0, math.nan, 1)), INPUT, "upright must be finite"),
+        (lambda g: tr.AlignConfig(em_steps=0), INPUT, "em_steps must be at least 1, got 0"),
+        (lambda g: tr.AlignConfig(m_steps=1.5), TYPE, "m_steps must be an integer, got float"),
+        (lambda g: tr.AlignConfig(num_candidates=True), TYPE, "num_candidates must be an integer, got bool"),
+        (lambda g: tr.AlignConfig(surface_steps=-1), INPUT, "surface_steps must be at least 0, got -1"),
+        (lambda g: tr.AlignConfig(sharpness=0.0), INPUT, "sharpness must be positive and finite"),
+        (lambda g: tr.AlignConfig(pose_atol=-1.0), INPUT, "pose_atol must be zero or positive"),
+        (lambda g: tr.AlignConfig(debias=math.nan), INPUT, "debias must be zero or positive and finite"),
+        (lambda g: tr.AlignConfig(inlier_distance=0.0), INPUT, "inlier_distance must be positive"),
+        (lambda g: tr.AlignConfig(prior_std=-1.0), INPUT, "prior_std must be positive"),
+        (lambda g: tr.FindPoseConfig(num_placed=-1), INPUT, "num_placed must be at least 1, got -1"),
+        (lambda g: tr.FindPoseConfig(num_searched=1.5), TYPE, "num_searched must be an integer, got float"),
+        (lambda g: tr.FindPoseConfig(num_retries=-1), INPUT, "num_retries must be at least 0, got -1"),
+        (lambda g: tr.FindPoseConfig(prior_std=0.0), INPUT, "prior_std must be positive and finite, got 0.0"),
+        (lambda g: tr.FindPoseConfig(nan_policy="drop"), INPUT, "nan_policy must be one of raise, omit; got 'drop'"),
+        (lambda g: tr.PoseInitializerConfig(noise=0.0), INPUT, "noise must be positive"),
+        (lambda g: tr.PoseInitializerConfig(fit_steps=0), INPUT, "fit_steps must be at least 1"),
+        (lambda g: tr.PoseInitializerConfig(chunk=0), INPUT, "chunk must be at least 1"),
+        (lambda g: tr.CalibrateConfig(rounds=0), INPUT, "rounds must be at least 1, got 0"),
+        (lambda g: tr.CalibrateConfig(steps=2.0), TYPE, "steps must be an integer, got float"),
+        (lambda g: tr.CalibrateConfig(size_std=0.0), INPUT, "size_std must be positive"),
+        (lambda g: tr.CalibrateConfig(radius_std=math.inf), INPUT, "radius_std must be positive and finite"),
     ],
 )  # fmt: skip
 def test_bad_arguments(given, call, error, message):
     with pytest.raises(error, match=message):
         call(given)
-
-
-# Settings
-
-
-@pytest.mark.parametrize(
-    ("config", "options", "error", "message"),
-    [
-        (
-            tr.AlignConfig,
-            {"search": "often"},
-            INPUT,
-            "search must be one of auto, always, never; got 'often'",
-        ),
-        (
-            tr.AlignConfig,
-            {"correspondence": "icp"},
-            INPUT,
-            "correspondence must be one of em, softassign",
-        ),
-        (tr.AlignConfig, {"outlier": "none"}, INPUT, "outlier must be one of limit, volume"),
-        (tr.AlignConfig, {"nan_policy": "drop"}, INPUT, "nan_policy must be one of raise, omit"),
-        (tr.AlignConfig, {"upright": (0, 1)}, INPUT, "upright must have shape"),
-        (tr.AlignConfig, {"upright": (0, 0, 0)}, INPUT, "upright must be a direction, got zeros"),
-        (tr.FindPoseConfig, {"upright": (0, math.nan, 1)}, INPUT, "upright must be finite"),
-        (tr.AlignConfig, {"em_steps": 0}, INPUT, "em_steps must be at least 1, got 0"),
-        (tr.AlignConfig, {"m_steps": 1.5}, TYPE, "m_steps must be an integer, got float"),
-        (
-            tr.AlignConfig,
-            {"num_candidates": True},
-            TYPE,
-            "num_candidates must be an integer, got bool",
-        ),
-        (tr.AlignConfig, {"surface_steps": -1}, INPUT, "surface_steps must be at least 0, got -1"),
-        (tr.AlignConfig, {"sharpness": 0.0}, INPUT, "sharpness must be positive and finite"),
-        (tr.AlignConfig, {"pose_atol": -1.0}, INPUT, "pose_atol must be zero or positive"),
-        (tr.AlignConfig, {"debias": math.nan}, INPUT, "debias must be zero or positive and finite"),
-        (tr.AlignConfig, {"inlier_distance": 0.0}, INPUT, "inlier_distance must be positive"),
-        (tr.AlignConfig, {"prior_std": -1.0}, INPUT, "prior_std must be positive"),
-        (tr.FindPoseConfig, {"num_placed": -1}, INPUT, "num_placed must be at least 1, got -1"),
-        (
-            tr.FindPoseConfig,
-            {"num_searched": 1.5},
-            TYPE,
-            "num_searched must be an integer, got float",
-        ),
-        (tr.FindPoseConfig, {"num_retries": -1}, INPUT, "num_retries must be at least 0, got -1"),
-        (tr.FindPoseConfig, {"prior_std": 0.0}, INPUT, "prior_std must be positive and finite, got 0.0"),
-        (
-            tr.FindPoseConfig,
-            {"nan_policy": "drop"},
-            INPUT,
-            "nan_policy must be one of raise, omit; got 'drop'",
-        ),
-        (tr.PoseInitializerConfig, {"noise": 0.0}, INPUT, "noise must be positive"),
-        (tr.PoseInitializerConfig, {"fit_steps": 0}, INPUT, "fit_steps must be at least 1"),
-        (tr.PoseInitializerConfig, {"chunk": 0}, INPUT, "chunk must be at least 1"),
-        (tr.CalibrateConfig, {"rounds": 0}, INPUT, "rounds must be at least 1, got 0"),
-        (tr.CalibrateConfig, {"steps": 2.0}, TYPE, "steps must be an integer, got float"),
-        (tr.CalibrateConfig, {"size_std": 0.0}, INPUT, "size_std must be positive"),
-        (tr.CalibrateConfig, {"radius_std": math.inf}, INPUT, "radius_std must be positive and finite"),
-    ],
-)
-def test_bad_settings(config, options, error, message):
-    with pytest.raises(error, match=message):
-        config(**options)

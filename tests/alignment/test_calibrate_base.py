@@ -11,7 +11,7 @@ from tests.alignment.made import ARM, offset
 from torchreg.alignment.base.frames import read_joints
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
-from torchreg.geometry.visibility import sample_visible
+from torchreg.geometry.visibility import rasterize, sample_visible
 
 JOINTS = torch.tensor([[0.3, 0.9, -0.4], [-0.8, -1.1, 0.7], [1.6, 0.5, 1.1]], dtype=torch.float64)
 BASE = offset(0.1, 0.25, 1.2)
@@ -102,17 +102,13 @@ def test_errors_that_all_frames_share_lie_within_the_ellipsoid(arm, clouds, scal
 OFF = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])
 
 
-@pytest.fixture(scope="module")
-def with_offsets(arm, clouds):
-    """Found from readings that are off; the first joint's offset turns the base alone but for the base's own link."""
-    return tr.calibrate_base(arm, clouds, JOINTS - OFF, offsets=True)
-
-
-def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(with_offsets):
-    assert with_offsets.status is tr.Status.CONVERGED
-    assert errors(with_offsets.T_camera_base)[0] < 0.003
-    assert math.degrees(float((with_offsets.offsets - OFF)[:2].abs().max())) < 0.2
-    assert float(with_offsets.offset_std[1]) > 0
+def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(arm, clouds):
+    """The first joint's offset turns the base alone but for the base's own link."""
+    found = tr.calibrate_base(arm, clouds, JOINTS - OFF, offsets=True)
+    assert found.status is tr.Status.CONVERGED
+    assert errors(found.T_camera_base)[0] < 0.003
+    assert math.degrees(float((found.offsets - OFF)[:2].abs().max())) < 0.2
+    assert float(found.offset_std[1]) > 0
 
 
 def test_clouds_without_the_robot_are_told(arm):
@@ -123,28 +119,14 @@ def test_clouds_without_the_robot_are_told(arm):
 
 def test_depth_frames_in_any_world_give_the_base_in_camera_coordinates(arm):
     camera = tr.Camera(80, 60, (100.0, 100.0, 39.5, 29.5))
-    ahead = camera.directions(torch.cartesian_prod(torch.arange(80.0), torch.arange(60.0)).double())
-    frames = []
+    moved, frames = tr.Camera(80, 60, camera.intrinsics, BASE), []
     for row in JOINTS:
-        depth = ray_depths(posed_mesh(arm, row), ahead).reshape(80, 60).mT
-        moved = tr.Camera(80, 60, camera.intrinsics, BASE)
-        frames.append(tr.DepthFrame(depth, moved, depth > 0))
+        raster = rasterize(posed_mesh(arm, row), camera.view())
+        frames.append(tr.DepthFrame(raster.depth, moved, raster.face_index >= 0))
     found = tr.calibrate_base(arm, frames, JOINTS)
     shift, turn = errors(found.T_camera_base)
     assert shift < 0.006
     assert turn < 0.8
-
-
-def ray_depths(mesh, directions):
-    """Return the depths (N,) at which rays (N, 3) from the origin first meet a mesh, zero for none."""
-    best = torch.full_like(directions[:, 0], torch.inf)
-    for first, second, third in mesh.vertices[mesh.faces]:
-        sides = torch.stack((first - second, first - third), dim=-1).expand(len(directions), 3, 2)
-        system = torch.cat([sides, directions.unsqueeze(-1)], dim=-1)
-        u, v, t = torch.linalg.solve_ex(system, first.expand_as(directions))[0].unbind(-1)
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-        best = torch.where(hit, torch.minimum(best, t * directions[:, 2]), best)
-    return torch.where(best.isfinite(), best, 0.0)
 
 
 def test_joints_come_in_many_forms(arm):

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.optimize
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,9 +41,6 @@ def some_mask(*shape):
 def assert_same(found, expected, **tolerance):
     for field in FIELDS:
         torch.testing.assert_close(getattr(found, field), getattr(expected, field), **tolerance)
-
-
-# Every rule
 
 
 @every_rule
@@ -105,27 +101,11 @@ def test_a_batch_is_a_loop_and_one_cloud_serves_many_poses(rule):
 
 @every_rival
 @both_precisions
-@pytest.mark.parametrize("far", [1e6, 1e25])
-def test_far_outliers_get_nothing_and_move_nothing(rule, dtype, far):
-    model, data, sigma = cloud(30, dtype=dtype), cloud(30, seed=1, dtype=dtype), scalar(0.1, dtype)
-    plain = rule(model, data, sigma)
-    cluttered = rule(model, torch.cat([data, far + cloud(3, dtype=dtype)]), sigma)
-    assert cluttered.inlier_posterior[30:].tolist() == [0, 0, 0]
-    for field in ("weights", "targets", "squared_error"):
-        torch.testing.assert_close(getattr(cluttered, field), getattr(plain, field))
-    alone = rule(model, far + cloud(3, dtype=dtype), sigma)
-    assert alone.weights.tolist() == [0] * 30
-    assert torch.equal(alone.targets, model)
-    assert float(alone.squared_error) == 0
-
-
-@every_rival
-@both_precisions
 @pytest.mark.parametrize("sigma", [1e-3, 1e-8, 1e-20, 1e-30])
 def test_sigma_may_vanish(rule, dtype, sigma):
     """Points that coincide match, with certainty or as one pair does; everything else is an outlier for certain."""
     model = cloud(40, dtype=dtype)
-    data = torch.cat([model[:5], cloud(30, seed=1, dtype=dtype) + 3])
+    data = torch.cat([model[:5], cloud(15, seed=1, dtype=dtype) + 3, cloud(15, seed=2, dtype=dtype) + 1e25])
     matches = rule(model, data, scalar(sigma, dtype), **(EXACT if rule is softassign else {}))
     torch.testing.assert_close(matches.targets, model)
     assert matches.inlier_posterior[5:].tolist() == [0] * 30
@@ -137,21 +117,6 @@ def test_sigma_may_vanish(rule, dtype, sigma):
     else:
         expected = torch.full_like(share, 1 / (MODEL_OUTLIER * OUTLIER_CONSTANT))
         torch.testing.assert_close(share / (1 - share).square(), expected, rtol=1e-4, atol=0)
-
-
-# Closest points
-
-
-def test_closest_points_by_hand():
-    model = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    data = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.3, 0.0], [1.2, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    matches = closest_point(model, data, torch.tensor(0.4 / TRIM))
-    assert matches.weights.tolist() == [2, 1, 0]
-    torch.testing.assert_close(matches.targets, torch.tensor([[0.05, 0.15, 0.0], [1.2, 0.0, 0.0], [5.0, 0.0, 0.0]]))
-    assert matches.inlier_posterior.tolist() == [1, 1, 1, 0]
-    assert float(matches.squared_error) == pytest.approx(0.01 + 0.09 + 0.04)
-    assert closest_point(model, data, torch.tensor(2.0)).inlier_posterior.tolist() == [1] * 4
-    assert closest_point(model, data, torch.tensor(0.22 / TRIM)).inlier_posterior.tolist() == [1, 0, 1, 0]
 
 
 @settings(max_examples=25, deadline=None)
@@ -170,23 +135,12 @@ def test_closest_points_are_those_of_a_tree(n, m, sigma, seed):
     assert float(matches.squared_error) == pytest.approx((distance[near] ** 2).sum(), abs=1e-12)
 
 
-def test_closest_points_are_the_limit_of_the_e_step():
-    model = cloud(30)
-    data = model[torch.arange(50) % 30] + 2e-3 * cloud(50, seed=1)
-    # So light an outlier class that every datum finds its partner, so narrow a kernel that it is the closest.
-    soft = expectation(model, data, scalar(1e-3), 1e-20)
-    assert_same(closest_point(model, data, scalar(1.0)), soft, atol=1e-6, rtol=1e-6)
-
-
 @pytest.mark.parametrize("entries", [1, 7, 50])
 def test_memory_does_not_change_the_answer(monkeypatch, entries):
     model, data, sigma = cloud(3, 6), cloud(3, 9, seed=1), torch.tensor([0.1, 0.2, 0.4], dtype=D)
     at_once = closest_point(model, data, sigma, mask=some_mask(3, 9))
     monkeypatch.setattr(e_step, "BUDGET", replace(e_step.BUDGET, table_entries=entries))
     assert_same(closest_point(model, data, sigma, mask=some_mask(3, 9)), at_once)
-
-
-# SoftAssign
 
 
 def as_printed(model, data, sigma, b, c, sweeps=3000):
@@ -202,8 +156,12 @@ def as_printed(model, data, sigma, b, c, sweeps=3000):
     return torch.from_numpy(matrix[:n, :m])
 
 
-def assert_moments(matches, matrix, model, data):
-    """Check matches against the full matrix (N, M)."""
+@pytest.mark.parametrize("sigma", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize(("n", "m"), [(6, 9), (9, 6), (7, 7), (1, 5)])
+def test_softassign_is_the_printed_normalizations(n, m, sigma):
+    model, data = cloud(n), cloud(m, seed=1)
+    matrix = as_printed(model.tolist(), data.tolist(), sigma, 0.7, 2.5)
+    matches = softassign(model, data, scalar(sigma), 2.5, model_outlier=0.7, **EXACT)
     torch.testing.assert_close(matches.weights, matrix.sum(-1), atol=1e-7, rtol=1e-7)
     torch.testing.assert_close(matches.inlier_posterior, matrix.sum(-2), atol=1e-7, rtol=1e-7)
     torch.testing.assert_close(matches.targets, matrix @ data / matrix.sum(-1, keepdim=True), atol=1e-6, rtol=1e-7)
@@ -211,40 +169,9 @@ def assert_moments(matches, matrix, model, data):
     torch.testing.assert_close(matches.squared_error, squares, atol=1e-7, rtol=1e-7)
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.2, 1.0])
-@pytest.mark.parametrize(("n", "m"), [(6, 9), (9, 6), (7, 7), (1, 5)])
-def test_softassign_is_the_printed_normalizations(n, m, sigma):
-    model, data = cloud(n), cloud(m, seed=1)
-    matrix = as_printed(model.tolist(), data.tolist(), sigma, 0.7, 2.5)
-    assert_moments(softassign(model, data, scalar(sigma), 2.5, model_outlier=0.7, **EXACT), matrix, model, data)
-
-
-def test_softassign_solves_a_convex_problem():
-    """The dual of entropic assignment with slack, minimized by another solver."""
-    model, data, sigma, b, c = cloud(5), cloud(8, seed=1), 0.3, MODEL_OUTLIER, OUTLIER_CONSTANT
-    kernel = torch.exp(-torch.cdist(model, data).square() / (2 * sigma**2)).numpy()
-
-    def dual(logs):
-        u, v = np.exp(logs[:5]), np.exp(logs[5:])
-        value = u @ kernel @ v + b * u.sum() + c * v.sum() - logs.sum()
-        return value, np.concatenate([u * (kernel @ v + b) - 1, v * (kernel.T @ u + c) - 1])
-
-    best = scipy.optimize.minimize(dual, np.zeros(13), jac=True, method="BFGS", options={"gtol": 1e-10})
-    u, v = np.exp(best.x[:5]), np.exp(best.x[5:])
-    matrix = torch.from_numpy(u[:, None] * kernel * v)
-    assert_moments(softassign(model, data, scalar(sigma), **EXACT), matrix, model, data)
-
-
 def test_without_a_sweep_softassign_is_the_e_step():
     model, data, sigma = cloud(20), cloud(30, seed=1), scalar(0.1)
     assert_same(softassign(model, data, sigma, sweeps=0), expectation(model, data, sigma))
-
-
-def test_one_pair_has_a_closed_form():
-    point, sigma, c = torch.zeros(1, 3, dtype=D), scalar(0.01), 2.0
-    for b in (MODEL_OUTLIER, 0.3):
-        share = float(softassign(point, point, sigma, c, model_outlier=b, **EXACT).weights)
-        assert share / (1 - share) ** 2 == pytest.approx(1 / (b * c))
 
 
 def test_softassign_is_differentiable():

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from tests.alignment.made import TIPS, D, cloud, generator, joint, machine, off, problem_of, shape_of, solid
-from torchreg.alignment.fit.problem import alignment_cost
-from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations, typical_poses
+from tests.alignment.made import TIPS, D, cloud, generator, joint, machine, off, shape_of, solid
+from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations
 from torchreg.geometry.rotation import so3_exp, so3_log
 
 QUICK = tr.FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1, num_model_points=200)
@@ -57,12 +56,9 @@ def test_padding_and_non_finite_data_do_not_count(plain_hand, find, two_clouds, 
     data[0, 30], data[1, 40:60] = torch.nan, torch.inf
     found = find(data, mask=mask, config=replace(QUICK, nan_policy="omit"))
     assert float(off(plain_hand, found.best, two_hands)[:, TIPS].mean(1).max()) < 0.005
-
-
-def test_a_cloud_of_a_batch_may_be_empty(plain_hand, find, two_clouds, two_hands):
-    mask = torch.ones(2, 400, dtype=torch.bool)
+    # A cloud of a batch may be empty.
     mask[1] = False
-    found = find(two_clouds, mask=mask)
+    found = find(data, mask=mask, config=replace(QUICK, nan_policy="omit"))
     assert bool(torch.isfinite(found.poses).all())
     assert float(off(plain_hand, found.best, two_hands)[0, TIPS].mean()) < 0.005
     assert float(found.confidence[1]) < 0.05
@@ -97,16 +93,13 @@ def test_the_seed_decides_and_the_global_state_does_not(find, two_clouds):
     assert not torch.equal(first.poses, other.poses)
 
 
-# Sources
-
-
 def test_sources_may_be_of_ones_own(plain_hand, find, two_clouds, two_hands):
     """One that knows roughly how a hand is held; it is asked once, in the coordinates of the problem's data."""
     asked = []
 
     def upside_down(problem, generator):
         asked.append(problem)
-        poses = typical_poses(plain_hand).repeat(len(problem.data), 1, 1)
+        poses = plain_hand.rest_pose().repeat(len(problem.data), 1, 1)
         poses[..., 3:6] = two_hands[0, 3:6] + 0.3
         return poses
 
@@ -116,96 +109,82 @@ def test_sources_may_be_of_ones_own(plain_hand, find, two_clouds, two_hands):
     assert float(problem.data[problem.valid].mean(0).abs().max()) < 1e-5
 
 
-@pytest.fixture(scope="module")
-def problem(plain_hand, plain_hand_skin, two_clouds):
-    return problem_of(plain_hand_skin, two_clouds, plain_hand.rest_pose().repeat(2, 1), origin=two_clouds.mean(1))
+def rough(shape, skin, data, source):
+    """Return the rough poses of a source that `find_pose` gets for data; the middle of the shape lies amid these."""
+    kept = []
 
+    def asked(problem, generator):
+        kept.append((source(problem, generator), problem.skin))
+        return kept[0][0]
 
-def test_uniform_rotations_are_even_and_of_typical_poses_amid_the_data(plain_hand, plain_hand_skin, problem):
-    """Evener than random ones by the angle to the nearest other one, from traces of their products."""
-    poses, kinds = UniformRotations(400)(problem, generator()), len(typical_poses(plain_hand))
-    assert poses.shape == (2, 400 * kinds, 27)
-    assert len(poses[0, :, 6:].unique(dim=0)) == kinds
-    torch.testing.assert_close(poses[0, :, 3:], poses[1, :, 3:])
-    few = UniformRotations(7)(problem, generator())
-    middle = plain_hand_skin(few).mean(-2)
-    assert float(middle.std(1).max()) < 1e-5
+    tr.find_pose(shape, data, sources=[asked], model_points=skin, config=TINY)
+    poses, skin = kept[0]
+    middle = skin(poses).mean(-2)
+    assert float((middle - middle[:, :1]).abs().max()) < 1e-3
     assert float(middle.norm(dim=-1).max()) < 0.05
-    quaternion = torch.nn.functional.normalize(torch.randn(400, 4, generator=generator(), dtype=D), dim=-1)
+    return poses
+
+
+def test_uniform_rotations_are_even_and_of_several_poses_amid_the_data(plain_hand, plain_hand_skin, two_clouds):
+    """Evener than random ones by the angle to the nearest other one, from traces of their products."""
+    poses = rough(plain_hand, plain_hand_skin, two_clouds, UniformRotations(100))
+    assert 1 < len(poses[0, :, 6:].unique(dim=0)) == poses.shape[1] // 100
+    torch.testing.assert_close(poses[0, :, 3:], poses[1, :, 3:])
+    quaternion = torch.nn.functional.normalize(torch.randn(100, 4, generator=generator(), dtype=D), dim=-1)
     angle = 2 * torch.atan2(quaternion[:, 1:].norm(dim=-1), quaternion[:, 0])
     drawn = so3_exp(angle.unsqueeze(-1) * torch.nn.functional.normalize(quaternion[:, 1:], dim=-1))
-    spread = so3_exp(poses[0, :, 3:6].unique(dim=0).double())[:400]
-    apart = []
+    spread, apart = so3_exp(poses[0, :, 3:6].unique(dim=0).double())[:100], []
     for rotations in (spread, drawn):
         angles = torch.acos(((torch.einsum("aij,bij->ab", rotations, rotations) - 1) / 2).clamp(-1, 1))
         apart.append(angles.fill_diagonal_(math.pi).amin(1))
-    assert float(apart[0].min()) > 4 * float(apart[1].min())
+    assert float(apart[0].min()) > 3 * float(apart[1].min())
     assert float(apart[0].std()) < 0.5 * float(apart[1].std())
     # No direction is preferred: the mean of uniform rotations is zero.
-    assert float(spread.mean(0).abs().max()) < 0.02
+    assert float(spread.mean(0).abs().max()) < 0.06
 
 
-def test_upright_rotations_turn_about_the_vertical_alone(plain_hand, find, plain_hand_skin, problem, two_hands):
+def test_upright_rotations_turn_about_the_vertical_alone(plain_hand, plain_hand_skin, find, two_clouds, two_hands):
     up = torch.tensor([1.0, -2.0, 0.5])
-    poses = UprightRotations(tuple(up.tolist()), 8)(problem, generator())
+    poses = rough(plain_hand, plain_hand_skin, two_clouds, UprightRotations(tuple(up.tolist()), 8))
     turns, axis = so3_exp(poses[0, :8, 3:6]), up / up.norm()
     torch.testing.assert_close(turns @ torch.tensor(plain_hand.up), axis.expand(8, 3), atol=1e-5, rtol=0)
     steps = so3_log(turns[1:] @ turns[:-1].mT)
     torch.testing.assert_close(steps, (axis * math.tau / 8).expand(7, 3), atol=1e-5, rtol=0)
-    assert float(plain_hand_skin(poses).mean(-2).std(1).max()) < 1e-5
     truth = two_hands[0].clone()
     truth[3:6] = torch.tensor([0.0, 0.0, 2.0])
     found = find(plain_hand_skin(truth), sources=None, config=replace(QUICK, upright=plain_hand.up))
     assert float(off(plain_hand, found.best, truth)[TIPS].mean()) < 0.005
 
 
-def test_principal_axes_find_an_unbent_shape_at_once(plain_hand, plain_hand_skin):
-    """For data in a typical pose, one of the four ways is the truth, whatever the rotation, the shift and padding."""
-    truth = typical_poses(plain_hand)[:1].repeat(2, 1)
-    truth[:, :6] = torch.tensor([[0.3, 1.0, 0.2, 1.9, -0.7, 1.2], [0.0, 0.0, 0.0, -0.4, 2.5, 0.1]])
-    points = plain_hand_skin(truth)
-    data = torch.cat([points, torch.rand(2, 50, 3, generator=generator())], dim=1)
-    problem = problem_of(plain_hand_skin, data, truth, torch.arange(450).expand(2, 450) < 400, points.mean(1))
-    turned = so3_exp(PrincipalAxes()(problem, generator())[..., 3:6]) @ so3_exp(truth[:, None, 3:6]).mT
-    assert float(so3_log(turned).norm(dim=-1)[:, :4].amin(1).max()) < 0.02
+FREE = ("revolute", (1.0, 0.0, 0.0))
+ROOM = {
+    "a bolted machine": (machine(free_base=False), [[0, 0, 0, 0, 0, 0, 0.41, 1.1], [0, 0, 0, 0, 0, 0, 0.07, -0.8]]),
+    # Far from the rest pose: nothing says what is typical.
+    "joints without limits": (
+        shape_of(
+            [joint("body", -1), joint("left", 0, (0.15, 0, 0.05), *FREE), joint("right", 0, (-0.12, 0.05, 0), *FREE)],
+            [solid("ellipsoid", (0.2, 0.12, 0.07)), solid("capsule", (0.15, 0.03), 0, 0, 0.15),
+             solid("capsule", (0.1, 0.02), 0, 0, 0.1)],
+        ),
+        [[0.1, 0.0, 0.3, 2.0, 1.0, -0.5, 2.2, -1.4]],
+    ),
+    "a lopsided stone": (
+        shape_of([joint("stone", -1), joint("bump", 0, (0.12, 0.04, 0.03))],
+                 [solid("ellipsoid", (0.2, 0.12, 0.07)), solid("ellipsoid", (0.05, 0.06, 0.09))]),
+        [[1.0, 0.0, 0.3, 2.0, 1.0, -0.5]],
+    ),
+}  # fmt: skip
 
 
-# Other shapes
-
-
-def test_joints_of_a_bolted_machine_are_found():
-    shape = machine(free_base=False)
-    truth = shape.rest_pose().repeat(2, 1)
-    truth[:, 6:] = torch.tensor([[0.41, 1.1], [0.07, -0.8]])
-    data = tr.sample_skin(shape, 400, seed=3)(truth)
-    found = tr.find_pose(shape, data + 0.003 * torch.randn(2, 400, 3, generator=generator()), config=QUICK)
-    assert bool((found.poses[..., :6] == 0).all())
-    torch.testing.assert_close(found.best[:, 6:], truth[:, 6:], rtol=0, atol=0.03)
-
-
-def test_joints_without_limits_are_found():
-    """Far from the rest pose: nothing says what is typical."""
-    turn = ("revolute", (1.0, 0.0, 0.0))
-    joints = [joint("body", -1), joint("left", 0, (0.15, 0, 0.05), *turn), joint("right", 0, (-0.12, 0.05, 0), *turn)]
-    solids = [
-        solid("ellipsoid", (0.2, 0.12, 0.07)), solid("capsule", (0.15, 0.03), 0, 0, 0.15),
-        solid("capsule", (0.1, 0.02), 0, 0, 0.1),
-    ]  # fmt: skip
-    shape = shape_of(joints, solids)
-    truth = torch.tensor([0.1, 0.0, 0.3, 2.0, 1.0, -0.5, 2.2, -1.4])
+@pytest.mark.parametrize("name", ROOM)
+def test_other_shapes_are_found(name):
+    shape, truths = ROOM[name]
+    skin, truths = tr.sample_skin(shape, 400, seed=3), torch.tensor(truths)
+    data = skin(truths) + 0.003 * torch.randn(len(truths), 400, 3, generator=generator())
     config = tr.FindPoseConfig(num_candidates=32, num_placed=8, num_searched=3, prior_std=None)
-    found = tr.find_pose(shape, tr.sample_skin(shape, 400, seed=3)(truth), config=config)
-    end = torch.tensor([0.0, 0.0, 0.3, 1.0])
-    places = [(shape.part_transforms(pose)[1:] @ end)[:, :3] for pose in (found.best, truth)]
-    assert float((places[0] - places[1]).norm(dim=-1).max()) < 0.03
-
-
-def test_a_lopsided_stone_without_joints_is_turned_into_place():
-    joints = [joint("stone", -1), joint("bump", 0, (0.12, 0.04, 0.03))]
-    shape = shape_of(joints, [solid("ellipsoid", (0.2, 0.12, 0.07)), solid("ellipsoid", (0.05, 0.06, 0.09))])
-    truth, skin = torch.tensor([1.0, 0.0, 0.3, 2.0, 1.0, -0.5]), tr.sample_skin(shape, 400, seed=3)
-    found = tr.find_pose(shape, skin(truth), config=QUICK)
-    torch.testing.assert_close(skin(found.best), skin(truth), rtol=0, atol=0.015)
+    found = tr.find_pose(shape, data, config=config)
+    assert float((skin(found.best) - skin(truths)).norm(dim=-1).max()) < 0.03
+    assert bool((found.poses[..., :6] == 0).all()) is name.startswith("a bolted")
 
 
 def test_skinned_rigs_are_found_in_any_rotation_and_alone_as_in_a_batch(person):
@@ -224,18 +203,25 @@ def test_skinned_rigs_are_found_in_any_rotation_and_alone_as_in_a_batch(person):
     torch.testing.assert_close(person.vertices(alone), person.vertices(both[1]), rtol=0, atol=1e-3)
 
 
-# Doubt
-
-
-@pytest.mark.parametrize(("num_searched", "seed"), [(2, 0), (3, 1)])
-def test_a_symmetric_object_is_doubtful(num_searched, seed):
-    """An ellipsoid looks the same turned half a turn about any of its axes."""
+@pytest.mark.parametrize("num_searched", [2, 3])
+def test_a_symmetric_object_is_doubtful_and_its_other_poses_stand_in_the_result(num_searched):
+    """An ellipsoid looks the same turned half a turn about any of its axes: its rotation group."""
     egg = shape_of([joint("egg", -1)], [solid("ellipsoid", (0.2, 0.12, 0.07))])
     data = tr.sample_skin(egg, 300, seed=3)(torch.tensor([0.3, 0.0, 0.5, 1.0, 0.4, -0.8]))
-    found = tr.find_pose(egg, data, config=replace(QUICK, num_searched=num_searched, seed=seed))
+    found = tr.find_pose(egg, data, config=replace(QUICK, num_searched=num_searched))
     assert float(found.confidence) < 0.3
     assert found.poses.shape == (num_searched, 6)
     assert float(found.costs.max() - found.costs.min()) < 3.0
+    if num_searched == 2:
+        return
+    aligned = tr.align(egg, data)
+    assert aligned.rivals.shape == (3, 6)
+    assert "another pose explains nearly as much, its base turned by 180, 180, 180 deg" in aligned.doubt
+    local = so3_exp(aligned.pose[None, 3:6]).mT @ so3_exp(aligned.rivals[:, 3:6])
+    half_turns = torch.stack([torch.tensor(row).diag() for row in ((1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1))])
+    apart = (local[:, None] - half_turns).abs().amax((-2, -1))
+    assert float(apart.amin(1).max()) < 0.02
+    assert sorted(apart.argmin(1).tolist()) == [0, 1, 2]
 
 
 def test_noise_is_doubtful(find, starts):
@@ -254,38 +240,11 @@ def test_misfits_are_searched_for_again(find, two_clouds, two_hands, monkeypatch
         poses[:, 1, 2] += 0.01
         if len(searched) < 3:
             poses[-1, :, 2] += 0.02
-        return poses, torch.stack([alignment_cost(problem, poses[:, number]) for number in range(2)], dim=1)
+        away = (problem.surface.distance(problem.data.unsqueeze(1), poses).abs() > 0.004).sum(-1)
+        return poses, away.to(poses)
 
     monkeypatch.setattr("torchreg.alignment.find_pose._search", fail_twice)
     found = find(two_clouds, config=replace(QUICK, num_retries=5, seed=7))
     assert searched == [(7, 2), (8, 1), (9, 1)]
     torch.testing.assert_close(found.best, two_hands, atol=1e-5, rtol=0)
     assert bool((found.costs[:, :1] <= found.costs).all())
-
-
-def test_the_poses_after_which_a_box_looks_alike_stand_in_the_result(tmp_path):
-    file = tmp_path / "box.urdf"
-    solid = "<link name='{}'><visual><geometry><box size='{}'/></geometry></visual></link>"
-    joint = (
-        "<joint name='lid' type='revolute'><parent link='box'/><child link='pin'/><axis xyz='0 0 1'/>"
-        "<limit lower='-0.1' upper='0.1' effort='1' velocity='1'/></joint>"
-    )
-    file.write_text(
-        f"<robot name='b'>{solid.format('box', '.3 .2 .1')}{solid.format('pin', '.02 .02 .02')}{joint}</robot>"
-    )
-    box = tr.ArticulatedShape.from_urdf(file)
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(800, 3, generator=generator) - 0.5
-    face = torch.randint(0, 3, (800, 1), generator=generator)
-    points = points.scatter(1, face, 0.5 * points.gather(1, face).sign()) * torch.tensor([0.3, 0.2, 0.1])
-    turn = so3_exp(torch.tensor([[0.4, -1.1, 0.7]]))[0]
-    found = tr.align(box, points @ turn.mT + torch.tensor([0.5, 0.2, 0.9]))
-    assert found.rivals.shape == (3, box.num_dofs)
-    assert "another pose explains nearly as much, its base turned by 180, 180, 180 deg" in found.doubt
-    # The half turns about the three axes of the box: its rotation group.
-    local = so3_exp(found.pose[None, 3:6]).mT @ so3_exp(found.rivals[:, 3:6])
-    half_turns = torch.stack([torch.tensor(row).diag() for row in ((1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1))])
-    apart = (local[:, None] - half_turns).abs().amax((-2, -1))
-    assert float(apart.amin(1).max()) < 0.02
-    assert sorted(apart.argmin(1).tolist()) == [0, 1, 2]
-    assert found.rivals[:, :3].sub(found.pose[:3]).norm(dim=-1).max() < 1e-3

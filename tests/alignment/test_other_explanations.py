@@ -28,25 +28,23 @@ def on_pixels(mask):
     return lies_on
 
 
-@pytest.mark.parametrize(("background", "least", "most"), [(1.0, 1.0, 1.0), (1.5, 0.0, 0.0), (0.0, 0.0, 0.0)])
-def test_the_rim_is_open_where_the_surface_goes_on(background, least, most):
+@pytest.mark.parametrize(("background", "radius", "hole", "share"), [
+    (1.0, 11.0, False, 1.0), (1.5, 13.0, False, 0.0), (0.0, 13.0, False, 0.0), (1.5, 13.0, True, 0.0),
+])  # fmt: skip
+def test_the_rim_is_open_where_the_surface_goes_on(background, radius, hole, share):
+    """Pixels that measured nothing are no rim."""
     depth = torch.where(disk(), 1.0, background).double()
-    assert least <= open_rim(tr.DepthFrame(depth, CAMERA), on_pixels(disk(11.0 if background == 1 else 13.0))) <= most
+    if hole:
+        depth[20:28:4, 26:38:4] = 0.0
+    assert open_rim(tr.DepthFrame(depth, CAMERA), on_pixels(disk(radius))) == share
 
 
 def test_the_rim_is_open_by_its_share_whatever_the_mask_leaves_out():
     depth = torch.where(disk() | (torch.arange(48) > 24)[:, None], 1.0, 2.0).double()
     frame = tr.DepthFrame(depth, CAMERA)
-    assert 0.3 < open_rim(frame, on_pixels(disk())) < 0.7
-    assert open_rim(frame.cropped(disk()), on_pixels(disk())) == pytest.approx(
-        open_rim(frame, on_pixels(disk())), abs=0.1
-    )
-
-
-def test_pixels_that_measured_nothing_are_no_rim():
-    depth = torch.where(disk(), 1.0, 1.5).double()
-    depth[20:28:4, 26:38:4] = 0.0
-    assert open_rim(tr.DepthFrame(depth, CAMERA), on_pixels(disk(13.0))) == 0.0
+    shares = [open_rim(each, on_pixels(disk())) for each in (frame, frame.cropped(disk()))]
+    assert 0.3 < shares[0] < 0.7
+    assert shares[1] == pytest.approx(shares[0], abs=0.1)
 
 
 def test_planes_explain_a_box_better_than_a_shape_that_errs_but_no_ball():

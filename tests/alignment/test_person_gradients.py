@@ -1,19 +1,13 @@
-"""Gradients of a fitted person in the data: those of solving again, of fitting again, and of moving everything."""
-
-import copy
-import math
+"""Gradients of a fitted person in the data: those of fitting again, and of moving everything."""
 
 import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.fit.implicit_gradient import FixedPoint, attach_gradients
-from torchreg.alignment.shape.person_gradient import PairedPlanes
+from tests.alignment.made import person_pose
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.rotation import so3_exp, so3_log
-from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 
-D = torch.float64
 TRUTH = torch.tensor([0.8, -0.9, 0.7])
 QUICK = tr.AlignConfig(num_model_points=150, search="never")
 
@@ -22,9 +16,7 @@ QUICK = tr.AlignConfig(num_model_points=150, search="never")
 def scanned(person):
     """A cloud of all sides of a person with little noise, its pose, and the fit to it with gradients."""
     generator = torch.Generator().manual_seed(0)
-    pose = person.rest_pose()
-    pose[6:] = math.radians(12) * torch.randn(len(pose) - 6, generator=generator)
-    pose[:6] = torch.tensor([0.3, -0.2, 0.9, 0.1, -0.1, 0.15])
+    pose = person_pose(person, generator)
     mesh = tr.TriangleMesh(person.vertices(pose, TRUTH), person.surface.faces)
     data = sample_surface(mesh, 700, generator=generator)[0]
     data = (data + 0.001 * torch.randn(data.shape, generator=generator)).requires_grad_()
@@ -81,34 +73,3 @@ def test_stretching_the_data_changes_a_fit_as_a_fit_to_stretched_data(person, sc
     # Stature is 15 % a unit.
     assert found == pytest.approx(1 / 0.15, rel=0.2)
     assert found == pytest.approx(float(numeric[0]), rel=0.1)
-
-
-def test_gradients_are_those_of_solving_again(person):
-    shape = copy.deepcopy(person).double()
-    tree = ShapedTree(shape, shape.space)
-    generator = torch.Generator().manual_seed(1)
-    faces = person.surface.faces[torch.randperm(len(person.surface.faces), generator=generator)[:160]]
-    shares = torch.rand(160, 3, generator=generator, dtype=D)
-    shares = shares / shares.sum(-1, keepdim=True)
-    weights = (person.surface.weights[faces].to(D) * shares.unsqueeze(-1)).sum(1)
-    planes = PairedPlanes(ShapedSkin(tree, faces, shares, weights))
-    state = 0.1 * torch.randn(1, tree.num_dofs, generator=generator, dtype=D)
-    with torch.no_grad():
-        data = planes.skin(state) + 0.001 * torch.randn(1, 160, 3, generator=generator, dtype=D)
-    precision = torch.cat([torch.zeros(6), torch.full((tree.num_dofs - 6,), 1e3)]).to(D)
-    fixed = FixedPoint(
-        shape=tree, surface=planes, valid=torch.arange(160)[None] < 150, sigma=torch.full((1,), 0.012, dtype=D),
-        noise=torch.full((1,), 0.004, dtype=D), precision=precision, lower=tree.lower, upper=tree.upper,
-    )  # fmt: skip
-    start = state.clone()
-    solved = fixed.newton_steps(state, data, start, 8)
-    data.requires_grad_()
-    found = attach_gradients(fixed, solved, data, start)
-    direction = torch.randn(data.shape, generator=generator, dtype=D)
-    step = 1e-6
-    ahead, behind = (fixed.newton_steps(solved, data.detach() + sign * step * direction, start, 4) for sign in (1, -1))
-    numeric = (ahead - behind)[0] / (2 * step)
-    for number in (0, 4, 8, tree.num_dofs - 3, tree.num_dofs - 1):
-        (gradient,) = torch.autograd.grad(found[0, number], data, retain_graph=True)
-        assert float((gradient * direction).sum()) == pytest.approx(float(numeric[number]), rel=1e-5, abs=1e-7)
-        assert not gradient[0, 150:].any()

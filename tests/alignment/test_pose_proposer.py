@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
-import torchreg.alignment.find_pose as find_pose_module
+from tests.alignment.made import off
 from torchreg.alignment import train_initializer as train_module
 from torchreg.alignment.search.pose_proposer import HAND_WEIGHTS
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
@@ -21,38 +21,27 @@ def clouds(plain_hand):
     return random_clouds(tr.sample_skin(plain_hand, 1500), 0.26, poses, 400, generator)
 
 
-@pytest.fixture
-def small_training(monkeypatch):
-    small = replace(train_module._TRAINING, surface_points=200, validation=8)
-    monkeypatch.setattr(train_module, "_TRAINING", small)
-
-
 def test_hands_at_any_rotation_are_found_without_a_search(plain_hand, plain_hand_skin, clouds):
     layer = tr.PoseInitializer(plain_hand, tr.PoseInitializerConfig(search="never"), model_points=plain_hand_skin)
     with torch.no_grad():
         found = layer(clouds.points, clouds.mask)
-    error = (found.keypoints - plain_hand.keypoints(clouds.poses)).norm(dim=-1).mean(-1)
+    error = off(plain_hand, found.pose, clouds.poses).mean(-1)
     assert (error < 0.02).double().mean() >= 0.8
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
 
 
-def test_a_left_hand_is_found_as_the_right_one_in_a_mirror(plain_hand, clouds):
+def test_a_left_hand_and_one_as_large_as_a_house_are_found_by_the_same_network(plain_hand, clouds):
     right, left = tr.PoseInitializer(plain_hand).proposer, tr.PoseInitializer(tr.Hand(side="left")).proposer
     flip = torch.tensor([-1.0, 1.0, 1.0])
     found, seen = right.propose(clouds.points, clouds.mask), left.propose(clouds.points * flip, clouds.mask)
     posed = tr.Hand(side="left").keypoints(seen.poses[:, 0])
     torch.testing.assert_close(posed, plain_hand.keypoints(found.poses[:, 0]) * flip, atol=1e-4, rtol=0)
     torch.testing.assert_close(seen.surface, found.surface * flip, atol=1e-4, rtol=0)
+    large = tr.PoseInitializer(tr.Hand(scale=50.0)).proposer.propose(50 * clouds.points, clouds.mask)
+    torch.testing.assert_close(large.poses[..., 6:], found.poses[..., 6:], atol=1e-3, rtol=0)
+    torch.testing.assert_close(large.poses[..., :3], 50 * found.poses[..., :3], atol=1e-2, rtol=0)
     with pytest.raises(tr.errors.FormatError, match="another shape"):
         tr.PoseProposer.load(HAND_WEIGHTS, tr.Hand(side="left"))
-
-
-def test_a_hand_as_large_as_a_house_is_found_by_the_same_network(plain_hand, clouds):
-    large = tr.Hand(scale=50.0)
-    found = tr.PoseInitializer(large).proposer.propose(50 * clouds.points, clouds.mask)
-    small = tr.PoseInitializer(plain_hand).proposer.propose(clouds.points, clouds.mask)
-    torch.testing.assert_close(found.poses[..., 6:], small.poses[..., 6:], atol=1e-3, rtol=0)
-    torch.testing.assert_close(found.poses[..., :3], 50 * small.poses[..., :3], atol=1e-2, rtol=0)
 
 
 def test_only_what_is_doubtful_is_searched_for(plain_hand, plain_hand_skin, clouds, monkeypatch):
@@ -83,24 +72,19 @@ def test_a_cloud_gives_alone_what_it_gives_in_a_batch_and_moved(plain_hand, plai
     offset = torch.tensor([0.5, -1.0, 2.0])
     together = net.propose(clouds.points, clouds.mask)
     alone = net.propose(clouds.points[3:4] + offset, clouds.mask[3:4])
-    torch.testing.assert_close(
-        alone.poses, together.poses[3:4] + torch.nn.functional.pad(offset, (0, 24)), atol=1e-3, rtol=0
-    )
+    moved = together.poses[3:4] + torch.nn.functional.pad(offset, (0, 24))
+    torch.testing.assert_close(alone.poses, moved, atol=1e-3, rtol=0)
     torch.testing.assert_close(together.weights.sum(-1), torch.ones(12))
-
-
-def keypoint_errors(hand, found, pose):
-    return float((hand.keypoints(found) - hand.keypoints(pose)).norm(dim=-1).mean())
 
 
 def test_where_the_network_is_sure_nothing_is_searched(plain_hand, plain_hand_skin, clouds, monkeypatch):
     searched = []
-    monkeypatch.setattr(find_pose_module, "_search", lambda *given: searched.append(given))
+    monkeypatch.setattr("torchreg.alignment.find_pose._search", lambda *given: searched.append(given))
     row = int(clouds.mask.sum(-1).argmax())
     points = clouds.points[row, clouds.mask[row]]
     found = tr.find_pose(plain_hand, points, model_points=plain_hand_skin)
     assert not searched
-    assert keypoint_errors(plain_hand, found.best, clouds.poses[row]) < 0.015
+    assert float(off(plain_hand, found.best, clouds.poses[row]).mean()) < 0.015
     layer = tr.PoseInitializer(plain_hand, model_points=plain_hand_skin)
     for network in (layer, layer.proposer):
         again = tr.find_pose(plain_hand, points, initializer=network, model_points=plain_hand_skin)
@@ -113,23 +97,21 @@ def test_what_a_poor_network_proposes_does_not_spoil_a_search(plain_hand, plain_
     quick = tr.FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1)
     untrained = tr.PoseProposer(plain_hand, TINY).eval()
     found = tr.find_pose(plain_hand, points, initializer=untrained, model_points=plain_hand_skin, config=quick)
-    assert keypoint_errors(plain_hand, found.best, clouds.poses[row]) < 0.02
+    assert float(off(plain_hand, found.best, clouds.poses[row]).mean()) < 0.02
     assert (found.costs[0] <= found.costs).all()
 
 
 def test_a_network_of_another_shape_is_refused(plain_hand, arm, clouds):
     network = tr.PoseProposer(arm, TINY)
-    with pytest.raises(
-        tr.errors.InputError, match="initializer must be a network for this shape's 27 degrees of freedom"
-    ):
+    with pytest.raises(tr.errors.InputError, match="must be a network for this shape's 27 degrees of freedom"):
         tr.find_pose(plain_hand, clouds.points[0], initializer=network)
-    with pytest.raises(
-        tr.errors.InputTypeError, match=r"initializer must be a PoseProposer, or a PoseInitializer .* NoneType"
-    ):
+    with pytest.raises(tr.errors.InputTypeError, match=r"must be a PoseProposer, or a PoseInitializer .* NoneType"):
         tr.find_pose(arm, clouds.points[0], initializer=tr.PoseInitializer(arm))
 
 
-def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_hand, arm, tmp_path, small_training):
+def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_hand, arm, tmp_path, monkeypatch):
+    small = replace(train_module._TRAINING, surface_points=200, validation=8)
+    monkeypatch.setattr(train_module, "_TRAINING", small)
     path, rows, hand = tmp_path / "hand.safetensors", [], tr.Hand().requires_grad_(True)
     for steps in (2, 4):
         config = tr.TrainInitializerConfig(steps=steps, batch=4, every=2)

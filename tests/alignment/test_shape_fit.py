@@ -7,11 +7,9 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.shape.person_search import limb_restarts
-from torchreg.alignment.shape.shape_fit import _problem
+from tests.alignment.made import person_cloud, person_pose
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import sample_surface
-from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp, so3_log
 from torchreg.solvers.e_step import expectation
 from torchreg.solvers.oriented_e_step import oriented_expectation
@@ -19,24 +17,11 @@ from torchreg.solvers.oriented_e_step import oriented_expectation
 QUICK = tr.AlignConfig(num_model_points=150, search="never")
 
 
-@pytest.fixture(scope="module")
-def shape(person):
-    return person
-
-
 def scan(shape, coefficients, seed, *, one_sided=True, count=700):
-    """Points on what faces a camera at -y, with 2 mm noise and 5 % outliers, and their true pose."""
+    """A pose of a person and its cloud, with 2 mm noise and 5 % outliers."""
     generator = torch.Generator().manual_seed(seed)
-    pose = shape.rest_pose()
-    pose[6:] = math.radians(12) * torch.randn(len(pose) - 6, generator=generator)
-    pose[:6] = torch.tensor([0.3, -0.2, 0.9, 0.1, -0.1, 0.15])
-    mesh = tr.TriangleMesh(shape.vertices(pose, coefficients), shape.surface.faces)
-    points, face, _ = sample_surface(mesh, 4 * count, generator=generator)
-    faces_camera = mesh.face_normals()[face][:, 1] < -0.1
-    points = points[faces_camera] if one_sided else points
-    points = points[:count] + 0.002 * torch.randn(count, 3, generator=generator)
-    low, high = points.amin(0) - 0.2, points.amax(0) + 0.2
-    return pose, torch.cat([points, low + (high - low) * torch.rand(count // 20, 3, generator=generator)])
+    pose = person_pose(shape, generator)
+    return pose, person_cloud(shape, pose, coefficients, generator, count, one_sided=one_sided)
 
 
 def start_near(shape, pose):
@@ -45,72 +30,71 @@ def start_near(shape, pose):
     return start
 
 
-def test_one_side_of_a_person_tells_pose_and_shape(shape, tmp_path):
+def beside(shape, result, wanted):
+    """Return the mean distance of the vertices found from the nearest of the true ones."""
+    return float(torch.cdist(shape.vertices(result.pose, result.coefficients), wanted).amin(-1).mean())
+
+
+def test_one_side_of_a_person_tells_pose_and_shape(person, tmp_path):
     coefficients = torch.tensor([0.8, -0.9, 0.7])
-    pose, data = scan(shape, coefficients, seed=0)
+    pose, data = scan(person, coefficients, seed=0)
     steps = []
-    result = tr.align(shape, data, start_near(shape, pose), fit_shape=True, config=QUICK, on_step=steps.append)
-    error = (shape.vertices(result.pose, result.coefficients) - shape.vertices(pose, coefficients)).norm(dim=-1)
+    result = tr.align(person, data, start_near(person, pose), fit_shape=True, config=QUICK, on_step=steps.append)
+    error = (person.vertices(result.pose, result.coefficients) - person.vertices(pose, coefficients)).norm(dim=-1)
     assert float(error.mean()) < 0.01
     deviation = result.coefficient_covariance.diagonal().sqrt()
     assert bool(((result.coefficients - coefficients).abs() < 4 * deviation + 0.02).all())
-    assert result.covariance.shape == (shape.num_dofs, shape.num_dofs)
+    assert result.covariance.shape == (person.num_dofs, person.num_dofs)
     assert result.status is tr.Status.CONVERGED
     assert float(result.confidence) > 0.8
     mean = torch.zeros(3)
-    alone = tr.align(shape.with_coefficients(mean), data, start_near(shape, pose), config=QUICK)
-    off = (shape.vertices(alone.pose, mean) - shape.vertices(pose, coefficients)).norm(dim=-1)
+    alone = tr.align(person.with_coefficients(mean), data, start_near(person, pose), config=QUICK)
+    off = (person.vertices(alone.pose, mean) - person.vertices(pose, coefficients)).norm(dim=-1)
     assert float(off.mean()) > 3 * float(error.mean())
     assert {step.stage for step in steps} == {"em", "surface"}
-    assert all(step.pose.shape[-1] == shape.num_dofs for step in steps)
+    assert all(step.pose.shape[-1] == person.num_dofs for step in steps)
     result.save(tmp_path / "r.safetensors")
     assert torch.equal(tr.load(tmp_path / "r.safetensors").coefficients, result.coefficients)
 
 
-def test_scans_of_one_person_share_its_coefficients(shape):
-    coefficients = torch.tensor([-0.7, 0.8, 0.5])
-    pairs = [scan(shape, coefficients, seed, count=500) for seed in (1, 2)]
-    starts = torch.stack([start_near(shape, pose) for pose, _ in pairs])
-    found = tr.calibrate(shape, [data for _, data in pairs], starts, config=tr.CalibrateConfig(align=QUICK))
-    assert found.poses.shape == (2, shape.num_dofs)
-    assert float((found.coefficients - coefficients).abs().max()) < 0.12
-    wanted = shape.vertices(torch.stack([pose for pose, _ in pairs]), coefficients)
-    assert float((shape.vertices(found.poses, found.coefficients) - wanted).norm(dim=-1).mean()) < 0.01
-    rest = shape.rest_pose()
-    torch.testing.assert_close(found.shape(rest).points, shape.vertices(rest, found.coefficients))
-
-
-def test_scans_of_one_person_are_searched_without_starts(shape):
-    coefficients = torch.tensor([-0.7, 0.8, 0.5])
-    pairs = [scan(shape, coefficients, seed, count=500, one_sided=False) for seed in (1, 2)]
-    found = tr.calibrate(shape, [data for _, data in pairs], config=tr.CalibrateConfig(align=QUICK))
-    assert float((found.coefficients - coefficients).abs().max()) < 0.12
-    # It looks the same from the back.
-    wanted = shape.vertices(torch.stack([pose for pose, _ in pairs]), coefficients)
-    assert float(nearest_neighbor(shape.vertices(found.poses, found.coefficients), wanted)[1].mean()) < 0.02
+@pytest.mark.parametrize("started", [True, False])
+def test_scans_of_one_person_share_its_coefficients(person, started):
+    """From one side with starts; from all sides they are searched, and it looks the same from the back."""
+    coefficients, config = torch.tensor([-0.7, 0.8, 0.5]), tr.CalibrateConfig(align=QUICK)
+    poses, clouds = zip(
+        *(scan(person, coefficients, seed, count=500, one_sided=started) for seed in (1, 2)), strict=True
+    )
+    starts = torch.stack([start_near(person, pose) for pose in poses]) if started else None
+    found = tr.calibrate(person, list(clouds), starts, config=config)
     assert (found.status.usable, found.outliers) == (True, ())
+    assert found.poses.shape == (2, person.num_dofs)
+    assert float((found.coefficients - coefficients).abs().max()) < 0.12
+    posed, wanted = person.vertices(found.poses, found.coefficients), person.vertices(torch.stack(poses), coefficients)
+    assert float(torch.cdist(posed, wanted).amin(-1).mean()) < 0.02
+    assert not started or float((posed - wanted).norm(dim=-1).mean()) < 0.01
+    rest = person.rest_pose()
+    torch.testing.assert_close(found.shape(rest).points, person.vertices(rest, found.coefficients))
 
 
-def test_bones_of_a_rig_take_the_lengths_of_another(shape):
-    plain = shape.with_coefficients(torch.zeros(3))
+def test_bones_of_a_rig_take_the_lengths_of_another(person):
+    plain = person.with_coefficients(torch.zeros(3))
     coefficients = torch.tensor([0.9, 0.6, 0.8])
-    pose, data = scan(shape, coefficients, seed=4, one_sided=False, count=1200)
-    result = tr.align(plain, data, start_near(shape, pose), fit_shape="bones", config=QUICK)
+    pose, data = scan(person, coefficients, seed=4, one_sided=False, count=1200)
+    result = tr.align(plain, data, start_near(person, pose), fit_shape="bones", config=QUICK)
     rig = plain.with_bone_coefficients()
     assert rig.coefficient_names[:2] == ("size", "girth")
     # Arms are round: how they are twisted, no surface tells.
-    _, off = nearest_neighbor(rig.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
-    assert float(off.mean()) < 0.025
+    assert beside(rig, result, person.vertices(pose, coefficients)) < 0.025
     fitted, true = (one.keypoints(one.rest_pose()) for one in (
-        rig.with_coefficients(result.coefficients), shape.with_coefficients(coefficients)
+        rig.with_coefficients(result.coefficients), person.with_coefficients(coefficients)
     ))  # fmt: skip
     lengths = [(keypoints[1:] - keypoints[0]).norm(dim=-1) for keypoints in (fitted, true)]
     assert float((lengths[0] / lengths[1] - 1).abs().max()) < 0.06
 
 
-def test_by_how_much_parts_differ_from_the_whole_is_learned(shape):
-    rig = shape.with_coefficients(torch.zeros(3)).with_bone_coefficients()
-    pose = scan(shape, torch.zeros(3), seed=4)[0]
+def test_by_how_much_parts_differ_from_the_whole_is_learned(person):
+    rig = person.with_coefficients(torch.zeros(3)).with_bone_coefficients()
+    pose = scan(person, torch.zeros(3), seed=4)[0]
     whole = torch.zeros(len(rig.coefficient_names))
     whole[:2] = torch.tensor([0.15, 0.1])
     uneven = whole.clone()
@@ -119,7 +103,7 @@ def test_by_how_much_parts_differ_from_the_whole_is_learned(shape):
     for truth in (whole, uneven):
         mesh = tr.TriangleMesh(rig.vertices(pose, truth), rig.surface.faces)
         data = sample_surface(mesh, 1200, generator=torch.Generator().manual_seed(1))[0]
-        found = tr.align(rig, data, start_near(shape, pose), fit_shape=True, config=QUICK)
+        found = tr.align(rig, data, start_near(person, pose), fit_shape=True, config=QUICK)
         parts = slice(2, 2 + rig.num_parts)
         lengths.append((found.coefficients - truth)[parts].abs().mean())
         deviations.append(found.coefficient_covariance.diagonal()[parts].sqrt().mean())
@@ -150,8 +134,8 @@ def test_a_datum_goes_to_the_point_that_faces_as_it_does():
 
 
 @pytest.mark.parametrize("told", [False, True])
-def test_normals_of_one_side_face_the_camera(shape, told):
-    _, data = scan(shape, torch.zeros(3), seed=5, count=1500)
+def test_normals_of_one_side_face_the_camera(person, told):
+    _, data = scan(person, torch.zeros(3), seed=5, count=1500)
     camera = torch.tensor([0.0, -3.0, 1.0], dtype=torch.float64)
     turn = so3_exp(torch.tensor([0.3, 0.8, 2.0]))
     normals = facing_normals(data @ turn.mT, (turn.double() @ camera) if told else None) @ turn.double()
@@ -163,76 +147,56 @@ def test_noise_has_no_normals():
     assert bool((facing_normals(torch.rand(500, 3, generator=torch.Generator().manual_seed(0))) == 0).all())
 
 
-def test_a_person_is_found_without_a_start(shape):
+def test_a_person_is_found_without_a_start(person):
     coefficients = torch.tensor([0.9, -0.8, 0.4])
-    pose, data = scan(shape, coefficients, seed=3, count=600)
+    pose, data = scan(person, coefficients, seed=3, count=600)
     pose[3:6], moved = torch.tensor([0.4, 1.9, -0.7]), so3_exp(pose[3:6])
     turn = so3_exp(pose[3:6]) @ moved.mT
     data = (data - pose[:3]) @ turn.mT + pose[:3]
-    result = tr.align(shape, data, fit_shape=True, config=QUICK)
-    _, off = nearest_neighbor(shape.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
-    assert float(off.mean()) < 0.02
+    result = tr.align(person, data, fit_shape=True, config=QUICK)
+    assert beside(person, result, person.vertices(pose, coefficients)) < 0.02
     assert float(result.evidence[-1]) < 1, "no rival was compared"
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_a_person_found_leaning_is_set_upright(shape, seed, monkeypatch):
+@pytest.mark.parametrize(("seed", "found"), [(0, "leaning"), (3, "leaning"), (3, "an arm raised")])
+def test_a_person_found_leaning_or_with_an_arm_elsewhere_is_set_right(person, seed, found, monkeypatch):
     coefficients = torch.tensor([0.9, -0.8, 0.4])
-    pose, data = scan(shape, coefficients, seed, count=600)
+    pose, data = scan(person, coefficients, seed, count=600)
 
-    def leaning(problem, rig, people, count, generator, upright):
-        """The mean person at rest who leans by 50 degrees to the side, as the camera sees it."""
-        state = torch.cat([shape.rest_pose(), torch.zeros(3)]).unsqueeze(0)
-        state[0, 3:6] = compose_rotation_vectors(torch.tensor([0.0, math.radians(50), 0.0]), pose[3:6])
+    def misled(problem, rig, people, count, generator, upright):
+        """The mean person at rest who leans by 50 degrees as the camera sees it, or in the pose but for an arm."""
+        state = torch.cat([person.rest_pose(), torch.zeros(3)]).unsqueeze(0)
+        if found == "leaning":
+            state[0, 3:6] = compose_rotation_vectors(torch.tensor([0.0, math.radians(50), 0.0]), pose[3:6])
+        else:
+            state[0, : person.num_dofs] = pose
+            arm = [person.dof_names.index(f"{person.part_names[2]}_{axis}") for axis in "xyz"]
+            state[0, arm] += torch.tensor([0.3, 2.2, 0.0])
         state[:, :3] += problem.data[0].mean(0) - problem.skin(state)[0].mean(0)
         return state
 
-    monkeypatch.setattr("torchreg.alignment.shape.shape_fit.find_people", leaning)
-    result = tr.align(shape, data, fit_shape=True, config=QUICK)
-    off = (shape.vertices(result.pose, result.coefficients) - shape.vertices(pose, coefficients)).norm(dim=-1)
+    monkeypatch.setattr("torchreg.alignment.shape.shape_fit.find_people", misled)
+    result = tr.align(person, data, fit_shape=True, config=QUICK)
+    off = (person.vertices(result.pose, result.coefficients) - person.vertices(pose, coefficients)).norm(dim=-1)
     assert float(off.mean()) < 0.02
 
 
-def test_a_person_who_stands_is_sought_standing(shape):
+def test_a_person_who_stands_is_sought_standing(person):
     coefficients = torch.tensor([0.9, -0.8, 0.4])
-    pose, data = scan(shape, coefficients, seed=3, count=600)
+    pose, data = scan(person, coefficients, seed=3, count=600)
     # Upright in the data is x, and the person is turned about it.
     turn = so3_exp(torch.tensor([2.2, 0.0, 0.0])) @ so3_exp(torch.tensor([0.0, math.pi / 2, 0.0]))
     pose[3:6], pose[:3] = so3_log((turn @ so3_exp(pose[3:6])).unsqueeze(0))[0], turn @ pose[:3]
     data = data @ turn.mT
-    result = tr.align(shape, data, fit_shape=True, config=replace(QUICK, upright=(2, 0, 0)))
-    _, off = nearest_neighbor(shape.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
-    assert float(off.mean()) < 0.02
-    upside_down = tr.align(shape, data, fit_shape=True, config=replace(QUICK, upright=(-1, 0, 0)))
+    result = tr.align(person, data, fit_shape=True, config=replace(QUICK, upright=(2, 0, 0)))
+    assert beside(person, result, person.vertices(pose, coefficients)) < 0.02
+    upside_down = tr.align(person, data, fit_shape=True, config=replace(QUICK, upright=(-1, 0, 0)))
     assert float(upside_down.confidence) < float(result.confidence)
 
 
-def test_a_limb_on_the_data_of_another_is_swung_onto_its_own(shape):
-    coefficients = torch.zeros(3)
-    pose, data = scan(shape, coefficients, seed=3, one_sided=False, count=800)
-    names = list(shape.dof_names)
-    arm = [names.index(f"{shape.part_names[2]}_{axis}") for axis in "xyz"]
-    problem, state = _problem(
-        shape, data[None], torch.ones(1, len(data), dtype=torch.bool), pose[None], None, config=QUICK,
-        generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
-    problem, right = problem.rows(torch.zeros(1, dtype=torch.int64)), state[0].clone()
-    right[shape.num_dofs :] = 0
-    right[:3] = pose[:3] - problem.origin[0]
-    wrong = right.clone()
-    wrong[arm] += torch.tensor([0.3, 1.2, 0.0])
-    swung = limb_restarts(problem, wrong, 3, torch.Generator().manual_seed(0))
-    assert len(swung) == 3
-    points = problem.skin(torch.stack([right, wrong, swung[0]]))
-    apart = (points - points[0]).square().sum(-1).mean(-1).sqrt()
-    assert float(apart[2]) < 0.5 * float(apart[1])
-    kept = [dof for dof in range(len(wrong)) if dof not in arm]
-    torch.testing.assert_close(swung[0, kept], wrong[kept])
-
-
-def test_a_person_in_what_is_none_is_doubtful(shape):
+def test_a_person_in_what_is_none_is_doubtful(person):
     generator = torch.Generator().manual_seed(0)
     sheet = torch.rand(400, 3, generator=generator) * torch.tensor([1.2, 0.5, 0.02])
-    result = tr.align(shape, sheet, shape.rest_pose(), fit_shape=True, config=QUICK)
+    result = tr.align(person, sheet, person.rest_pose(), fit_shape=True, config=QUICK)
     assert result.status is tr.Status.DOUBTFUL
     assert float(result.confidence) < 0.2

@@ -7,12 +7,9 @@ import pytest
 import torch
 
 import torchreg as tr
-import torchreg.tracking.recovery as recovery
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.geometry.sampling import farthest_points
-from torchreg.tracking.frame import Frame
-from torchreg.tracking.frame_fit import FrameFitter
 
 FRAMES = 8
 TIPS = [4, 8, 12, 16, 20]
@@ -20,37 +17,31 @@ HINGE = 6
 
 
 @pytest.fixture(scope="session")
-def arm_tracking(arm):
-    """A pose of the arm, 300 points of its surface, and how to make a fitter, a state and a frame of a tracker."""
+def tracking(arm):
+    """A pose of the arm, 300 points of its surface, states of its tracker, and the step from one on some data."""
     pose = torch.tensor([0.3, -0.2, 0.8, 0.4, 0.2, -0.5, 0.7], dtype=torch.float64)
     vertices = arm.surface_mesh(pose, spacing=0.01).vertices
     cloud = vertices[farthest_points(vertices, 300)]
     skin = tr.sample_skin(arm, 200)
     initial = tr.Tracker(arm, pose, model_points=skin).state
 
-    def fitter(**options):
-        return FrameFitter(arm, tr.TrackConfig(**options), skin)
-
     def state(**changes):
-        means = {"num_data": 300.0, "num_inliers": 300.0, "ratio_in_reach": 1.0, "residual": 0.001}
+        means = {"num_data": 300.0, "num_inliers": 300.0, "ratio_in_reach": 1.0, "residual": 0.001, "sure": True}
         motion = {"interval": 1.0, "prediction_error": 0.005, "innovation": pose.new_tensor([0.005, 0.04, 0.04])}
         return replace(initial, **{"frame": 1} | means | motion | changes)
 
-    def frame(points=cloud, elapsed=1.0):
-        return Frame(points, points.isfinite().all(-1), elapsed)
+    def step(state, points=cloud, time=None, **options):
+        """Return the result of a frame and the state after it."""
+        made = tr.Tracker(arm, pose, config=tr.TrackConfig(**options), model_points=skin)
+        made.state = state
+        return made.step(points, time), made.state
 
     def bent(angle):
         moved = pose.clone()
         moved[HINGE] += angle
         return moved
 
-    return SimpleNamespace(pose=pose, cloud=cloud, skin=skin, fitter=fitter, state=state, frame=frame, bent=bent)
-
-
-@pytest.fixture
-def tracking(arm_tracking):
-    with torch.no_grad():
-        yield arm_tracking
+    return SimpleNamespace(pose=pose, cloud=cloud, skin=skin, state=state, step=step, bent=bent)
 
 
 @pytest.fixture(scope="session")
@@ -130,7 +121,7 @@ def find(monkeypatch):
             chosen = poses(len(calls)) if callable(poses) else poses
             return tr.PoseStarts(chosen, torch.tensor(costs), torch.tensor(0.9, dtype=chosen.dtype))
 
-        monkeypatch.setattr(recovery, "find_pose", found)
+        monkeypatch.setattr("torchreg.tracking.recovery.find_pose", found)
         return calls
 
     return replace_by

@@ -1,14 +1,12 @@
 """Frames that show no shape are named; a shape that is doubtful, lost or unknown is searched, ever more rarely."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
 
 import torchreg as tr
-from torchreg.datasets.hand import hand_motion
-from torchreg.tracking import recovery
+from torchreg.tracking.recovery import flipped_poses
 
 
 def test_bad_frames_are_named_and_do_not_stop_the_tracker(plain_hand, tip_errors, noise_frame, tracker, clouds, frames):
@@ -36,16 +34,6 @@ def test_bad_frames_are_named_and_do_not_stop_the_tracker(plain_hand, tip_errors
     assert tip_errors(good.keypoints[None], clouds[3:4]).mean() < 0.004
 
 
-def test_held_predictions_slow_down(tracker, tracked):
-    made, steps = tracker(state=tracked.states[-1]), []
-    for _ in range(6):
-        before = made.state.pose
-        made.step(torch.zeros(0, 3))
-        steps.append(float((made.state.pose - before).norm()))
-    assert steps[0] > 1e-4
-    assert all(later < 0.97 * earlier for earlier, later in pairwise(steps))
-
-
 def test_a_hand_that_leaps_out_of_reach_is_proposed_by_the_network_at_once(tip_errors, tracker, clouds, frames):
     made, turn, shift = tracker(), torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), torch.tensor([0.4, -0.3, 0.2])
     made.run(frames[:2])
@@ -58,18 +46,11 @@ def moved(pose, x):
     return torch.cat([pose[:1] + x, pose[1:]])
 
 
-def test_without_a_pose_the_first_frame_is_found(tip_errors, tracker, clouds, frames, find, truths):
-    find(truths[:1] + 0.004, [10.0])
-    result = tracker(None).run(frames[:3])
-    assert result.acquired == ("found", "tracked", "tracked")
-    assert tip_errors(result.keypoints[1:], clouds[1:3]).mean() < 0.006
-
-
 def test_a_wrong_pose_that_was_found_is_corrected_in_the_next_frame(
     plain_hand, plain_hand_skin, tracker, frames, find, truths
 ):
     """The first search, repeated three times, takes the hand for a flipped one; that in the next frame does not."""
-    flipped = recovery.flipped_poses(plain_hand_skin, truths[0])[:1]
+    flipped = flipped_poses(plain_hand_skin, truths[0])[:1]
     find(lambda number: flipped if number <= 4 else truths[1:2], [10.0])
     made = tracker(None)
     for frame, truth, correct in zip(frames, truths[:2], (False, True), strict=False):
@@ -132,106 +113,64 @@ def test_what_was_doubtful_in_all_frames_is_forgotten_when_it_is_gone(plain_hand
     assert (plain_hand.keypoints(records[2].pose) - plain_hand.keypoints(truths[2])).norm(dim=-1).mean() < 0.005
 
 
-def test_a_lost_hand_is_found_where_it_is_nearest(plain_hand, noise_frame, truths, frames, tracker, tracked, find):
-    """The hand vanishes for frames and comes back far away; of equally good poses the one near the last is taken."""
-    calls = find(torch.stack([moved(truths[5], 0.3), truths[5], truths[5]]), [10.0, 11.0, 300.0])
-    made = tracker(state=replace(tracked.states[4], pose=moved(tracked.states[4].pose, -0.4)))
-    records = [made.step(noise_frame(seed=k)) for k in range(3)]
-    assert {record.status for record in records} == {tr.Status.LOST}
-    assert calls == []
-    records = [made.step(frames[5]) for _ in range(9)]
-    first = next(record for record in records if record.status.usable)
-    assert first.acquired == "found"
-    assert (first.keypoints - plain_hand.keypoints(truths[5])).norm(dim=-1).mean() < 0.005
-    assert len(calls) >= 1
-
-
-def test_fingers_that_were_missed_are_repaired_within_frames(plain_hand, tip_errors, clouds, frames, tracker, tracked):
-    """With two fingers far off their data the evidence drops, and limbs are placed anew."""
-    wrong = tracked.states[4].pose.clone()
-    for name in ("index_mcp_flexion", "middle_mcp_flexion"):
-        wrong[plain_hand.dof_names.index(name)] += 1.0
-    state = replace(tracked.states[4], pose=plain_hand.clamp(wrong))
-    made = tracker(state=state)
-    records = [made.step(frames[number]) for number in (5, 6, 7)]
-    assert {record.acquired for record in records} & {"surface", "starts", "search"}
-    assert tip_errors(records[2].keypoints[None], clouds[7:8]).mean() < 0.004
-    assert tracker(state=state, recovery="none").step(frames[5]).acquired in ("tracked", "lost")
-
-
-def attempt(tracking, state, level="full", cloud=None):
-    """Return what a recovery makes of a frame after descent from a state's prediction, and what descent led to."""
-    fitter, frame = tracking.fitter(recovery=level), tracking.frame(tracking.cloud if cloud is None else cloud)
-    view = fitter.look(state, frame, fitter.predict(state, frame.elapsed))
-    fit = None if view is None else fitter.descend(view, state, frame.elapsed)
-    return *recovery.Recovery(fitter)(state, frame, view, fit), fit
-
-
-def test_a_flipped_base_is_among_the_starts(plain_hand, plain_hand_skin):
-    truth = hand_motion(plain_hand, "bending_palm", 1, seed=1)[0]
-    flipped = recovery.flipped_poses(plain_hand_skin, truth)
-    points = plain_hand_skin(truth)
+def test_a_flipped_base_is_among_the_starts(plain_hand_skin, truths):
+    flipped = flipped_poses(plain_hand_skin, truths[0])
+    points = plain_hand_skin(truths[0])
     for pose in flipped:
         turned = plain_hand_skin(pose)
         torch.testing.assert_close(turned.mean(0), points.mean(0), atol=1e-5, rtol=0)
         assert (turned - points).norm(dim=-1).max() > 0.02
     # Half turns: done twice, nothing happened.
-    again = torch.stack([plain_hand_skin(pose) for pose in recovery.flipped_poses(plain_hand_skin, flipped[2])])
+    again = torch.stack([plain_hand_skin(pose) for pose in flipped_poses(plain_hand_skin, flipped[2])])
     assert (again - points).norm(dim=-1).amax(-1).min() < 1e-4
 
 
 def test_a_limb_that_was_missed_is_placed_anew(tracking):
     state = tracking.state(pose=tracking.bent(-1.2), failed_searches=1)
-    fit, after, descended = attempt(tracking, state)
-    assert (descended.world_pose - tracking.pose)[-1].abs() > 0.2
-    assert fit.acquired in ("surface", "starts")
-    torch.testing.assert_close(fit.world_pose, tracking.pose, atol=0.01, rtol=0)
-    assert fit.soft_inliers > descended.soft_inliers + 4
+    plain, _ = tracking.step(state, recovery="none")
+    assert (plain.pose - tracking.pose)[-1].abs() > 0.2
+    result, after = tracking.step(state)
+    assert result.acquired in ("surface", "starts")
+    torch.testing.assert_close(result.pose, tracking.pose, atol=0.01, rtol=0)
     # Nothing that data show goes so far in a frame: the doubt remains.
     assert (after.cool_down, after.failed_searches) == (2, 2)
 
 
 def test_nothing_is_tried_where_it_may_not_or_was_tried_lately(tracking, find):
     calls = find(tracking.pose[None], [10.0])
-    for level, changes in (("none", {}), ("full", {"cool_down": 2})):
-        state = tracking.state(pose=tracking.bent(-0.3), **changes)
-        fit, after, descended = attempt(tracking, state, level)
-        assert fit is descended
-        assert after == recovery.after_pause(state)
+    for level, changes, cool_down in (("none", {}, 0), ("full", {"cool_down": 2}, 1)):
+        result, after = tracking.step(tracking.state(pose=tracking.bent(-0.3), **changes), recovery=level)
+        assert result.acquired == "tracked"
+        assert after.cool_down == cool_down
     assert calls == []
 
 
 def test_what_is_long_lost_is_searched_everywhere_and_taken_where_it_is_nearest(tracking, find):
     calls = find(torch.stack([moved(tracking.pose, 0.5), tracking.pose]), [10.0, 12.0])
     for lost, level, found in ((2, "full", False), (3, "starts", False), (3, "full", True)):
-        state = tracking.state(pose=moved(tracking.pose, -5.0), lost=lost)
-        fit, after, descended = attempt(tracking, state, level)
-        assert descended is None
-        assert (fit is not None) == found
-        assert (after.failed_searches == 0) == found
-    assert fit.acquired == "found"
-    torch.testing.assert_close(fit.world_pose, tracking.pose, atol=5e-3, rtol=0)
+        result, after = tracking.step(tracking.state(pose=moved(tracking.pose, -5.0), lost=lost), recovery=level)
+        assert (result.acquired == "found", after.failed_searches == 0) == (found, found)
+    torch.testing.assert_close(result.pose, tracking.pose, atol=5e-3, rtol=0)
     assert len(calls) == 1
+
+
+UNKNOWN = {"num_inliers": 0.0, "ratio_in_reach": 0.0, "residual": 0.0, "sure": False}
 
 
 def test_what_lies_beside_its_data_is_searched_again_until_a_pose_explains_them(tracking, find):
     """The first search leads to where no data are, the second to the truth, and there is no third."""
     calls = find(lambda number: moved(tracking.pose, 0.5 if number == 1 else 0.0)[None], [10.0])
-    state = tracking.state(num_inliers=0.0, ratio_in_reach=0.0, residual=0.0)
-    frame = tracking.frame(torch.cat([tracking.cloud] * 11))
-    fit = recovery.Recovery(tracking.fitter()).everywhere(state, frame)
-    torch.testing.assert_close(fit.world_pose, tracking.pose, atol=5e-3, rtol=0)
+    state = tracking.state(pose=torch.full_like(tracking.pose, torch.nan), **UNKNOWN)
+    result, _ = tracking.step(state, torch.cat([tracking.cloud] * 11))
+    torch.testing.assert_close(result.pose, tracking.pose, atol=5e-3, rtol=0)
     (num_data, first), (_, second) = calls
     assert (first.seed, second.seed) == (0, 1)
     assert second.num_candidates == 2 * first.num_candidates
     # No more data are searched than tell anything.
     assert num_data == 3000
-
-
-def test_searches_everywhere_end_without_a_pose(tracking, find):
+    # Searches everywhere end without a pose.
     calls = find(moved(tracking.pose, 0.5)[None], [10.0])
-    state = tracking.state(num_inliers=0.0, ratio_in_reach=0.0)
-    assert recovery.Recovery(tracking.fitter()).everywhere(state, tracking.frame()) is None
+    assert tracking.step(state)[0].status is tr.Status.LOST
     assert [config.seed for _, config in calls] == [0, 1, 2, 3]
 
 
@@ -239,31 +178,7 @@ def test_noise_is_no_shape_and_a_hidden_one_is_not_searched(tracking, find):
     calls = find(torch.stack([moved(tracking.pose, 0.5), tracking.pose]), [10.0, 12.0])
     low, high = tracking.cloud.amin(0), tracking.cloud.amax(0)
     noise = low + (high - low) * torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    state = tracking.state(lost=3)
-    fit, after, _ = attempt(tracking, state, cloud=noise[:40])
-    assert fit is None
-    assert calls == []
-    assert after.failed_searches == 0
-    fit, after, _ = attempt(tracking, state, cloud=noise)
-    assert fit is None
-    assert len(calls) == 1
-    assert after == replace(state, failed_searches=1)
-
-
-def test_no_attempt_moves_the_base_farther_than_it_gets(tracking):
-    state, frame, fitter = tracking.state(), tracking.frame(), tracking.fitter()
-    recover = recovery.Recovery(fitter)
-    fit = fitter.fit_at(state, frame, tracking.pose, "surface")
-    for dof, step, too_far in (
-        (0, 0.3 * fitter.size, False),
-        (0, 0.5 * fitter.size, True),
-        (3, 1.0, False),
-        (3, 2.0, True),
-    ):
-        pose = fit.pose.clone()
-        pose[0, dof] += step
-        moved_fit = replace(fit, pose=pose)
-        assert recover._moves_too_far(state, frame, moved_fit) == too_far
-        # What was lost for a while may be anywhere, and a search everywhere takes nothing from the prediction.
-        assert not recover._moves_too_far(replace(state, lost=3), frame, moved_fit)
-        assert not recover._moves_too_far(state, frame, replace(moved_fit, acquired="found"))
+    for cloud, searched in ((noise[:40], 0), (noise, 1)):
+        result, after = tracking.step(tracking.state(lost=3), cloud)
+        assert result.status is tr.Status.LOST
+        assert (len(calls), after.failed_searches, after.lost) == (searched, searched, 4)

@@ -45,36 +45,21 @@ def test_the_hand_is_found_and_followed(three):
         assert 0.6 < share < 0.8
 
 
-def test_what_is_returned_can_be_saved(three, tmp_path):
-    result, _ = three
-    result.save(tmp_path / "poses.safetensors")
-    loaded = tr.load(tmp_path / "poses.safetensors")
-    assert torch.equal(loaded.track.poses, result.track.poses)
-    assert torch.equal(loaded.clouds[2], result.clouds[2])
-
-
-def stop_at(monkeypatch, frame):
-    """Let the keyboard interrupt the tracker while it works on a frame."""
-    step = tr.Tracker.step
+def test_an_interruption_keeps_the_frames_that_are_done(monkeypatch):
+    """The keyboard interrupts the tracker while it works on the third frame; before the first, nothing is kept."""
+    step, stop = tr.Tracker.step, 2
 
     def stopped(self, points, time=None, **keypoints):
-        if self.state.frame == frame:
+        if self.state.frame == stop:
             raise KeyboardInterrupt
         return step(self, points, time)
 
     monkeypatch.setattr(tr.Tracker, "step", stopped)
-
-
-def test_an_interruption_keeps_the_frames_that_are_done(monkeypatch):
-    stop_at(monkeypatch, 2)
     result = demo.run_demo(4, config=tr.TrackConfig(recovery="none"))
     assert len(result.track.poses) == len(result.truths) == len(result.clouds) == len(result.inliers) == 2
     # Without a search nothing is found.
     assert not result.track.poses.isfinite().any()
     assert result.tip_errors.isnan().all()
-
-
-def test_an_interruption_before_the_first_frame_leaves_nothing(monkeypatch):
-    stop_at(monkeypatch, 0)
+    stop = 0
     with pytest.raises(KeyboardInterrupt):
         demo.run_demo(2)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import torch
 
 import torchreg as tr
-from torchreg.tracking import model_points
 
 
 def one_side(tracking):
@@ -14,90 +13,71 @@ def one_side(tracking):
 
 
 def after(tracking, cloud, state=None, **options):
-    fitter, state = tracking.fitter(**options), state or tracking.state(num_inliers=float(len(cloud)))
-    fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
-    return fit, model_points.next_model_points(fitter, state, fit)
+    """Return the pose of a frame and the state after it."""
+    result, after = tracking.step(state or tracking.state(num_inliers=float(len(cloud))), cloud, **options)
+    return result.pose, after
 
 
-def test_seen_points_are_those_near_data(tracking):
-    cloud = one_side(tracking)
-    fit, (points, weights, reference) = after(tracking, cloud)
-    distances = torch.tensor([float((cloud - point).norm(dim=-1).min()) for point in tracking.skin(fit.world_pose)])
-    seen = distances < 0.03 * fit.view.problem.size
+def test_seen_points_are_those_near_data_and_occluded_ones_are_kept(tracking):
+    cloud, skin = one_side(tracking), tracking.skin
+    pose, state = after(tracking, cloud)
+    distances = torch.cdist(skin(pose), cloud).amin(-1)
+    size = (skin.points.amax(0) - skin.points.amin(0)).norm()
+    seen = distances < 0.03 * size
     assert 20 < seen.sum() < 180
-    assert torch.equal(points, tracking.skin.points[seen])
-    assert torch.equal(weights, tracking.skin.weights[seen])
-    assert torch.equal(reference, tracking.skin.reference_pose)
+    assert torch.equal(state.points, skin.points[seen])
+    assert torch.equal(state.weights, skin.weights[seen])
+    assert torch.equal(state.reference_pose, skin.reference_pose)
+    # With far fewer data than inliers before, what was seen is probably occluded.
+    points = skin.points[::2]
+    begin = tracking.state(points=points, weights=skin.weights[::2], num_inliers=2.0 * len(cloud))
+    kept = after(tracking, cloud, begin)[1].points
+    assert {tuple(point) for point in kept.tolist()} == {
+        tuple(point) for point in [*state.points.tolist(), *points.tolist()]
+    }
 
 
-def test_seen_points_face_the_camera(plain_hand_skin, tracked):
-    """The camera stands at the origin: most of what is kept of well-seen parts faces it."""
-    state = tracked.states[-1]
-    index = torch.cdist(state.points, plain_hand_skin.points).argmin(-1)
-    parts = plain_hand_skin.weights.argmax(-1)
-    on_palm = parts[index] == 0
-    towards = -(plain_hand_skin(state.pose) * plain_hand_skin.posed_normals(state.pose)).sum(-1) > 0
-    assert towards[index][on_palm].float().mean() > 0.8 > 0.6 > towards[parts == 0].float().mean()
-
-
-def test_parts_that_no_data_show_keep_their_points(arm, tracking):
+def test_parts_that_no_data_show_keep_their_points_or_take_those_of_the_shape(arm, tracking):
     body = arm.distance(tracking.cloud, tracking.pose, parts=[1]) > 0.03
-    _, (_, weights, _) = after(tracking, tracking.cloud[body])
-    parts, skin_parts = weights.argmax(-1), tracking.skin.weights.argmax(-1)
+    _, state = after(tracking, tracking.cloud[body])
+    parts, skin_parts = state.weights.argmax(-1), tracking.skin.weights.argmax(-1)
     assert (parts == 1).sum() == (skin_parts == 1).sum()
     assert (parts == 0).sum() < (skin_parts == 0).sum()
-
-
-def test_occluded_points_are_kept(tracking):
-    side = one_side(tracking)
-    points = tracking.skin.points[::2]
-    state = tracking.state(points=points, weights=tracking.skin.weights[::2], num_inliers=2.0 * len(side))
-    _, (kept, _, _) = after(tracking, side, state)
-    _, (seen, _, _) = after(tracking, side)
-    expected = {tuple(point) for point in torch.cat([seen, points]).tolist()}
-    assert {tuple(point) for point in kept.tolist()} == expected
+    _, state = after(tracking, tracking.cloud[body], model_points="data")
+    hinged = state.weights.argmax(-1) == 1
+    torch.testing.assert_close(state.points[hinged], tracking.skin(state.reference_pose)[skin_parts == 1])
+    assert len(state.points[~hinged]) == body.sum()
 
 
 def test_all_points_stay_where_asked_or_where_hardly_any_data_lie_on_the_shape(tracking):
-    for cloud, options in ((one_side(tracking), {"model_points": "shape"}), (tracking.cloud[:10] + 0.03, {})):
-        _, (points, _, _) = after(tracking, cloud, **options)
-        assert torch.equal(points, tracking.skin.points)
+    for cloud, options in ((one_side(tracking), {"model_points": "shape"}), (tracking.cloud[::30], {})):
+        begin = tracking.state(
+            num_inliers=float(len(cloud)), points=tracking.skin.points[:90], weights=tracking.skin.weights[:90]
+        )
+        _, state = after(tracking, cloud, begin, **options)
+        assert torch.equal(state.points, tracking.skin.points) is ("model_points" in options)
 
 
-def test_data_become_model_points_in_balance(tracking):
+def test_data_become_model_points_in_balance_and_each_frame_draws_anew(arm, tracking):
     generator = torch.Generator().manual_seed(5)
     outliers = tracking.cloud[::10] + 0.05 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
-    cloud = torch.cat([tracking.cloud, outliers])
-    fit, (points, weights, reference) = after(tracking, cloud, model_points="data", num_model_points=80)
-    local = fit.view.problem.data[0]
-    source = torch.cdist(points, local, compute_mode="donot_use_mm_for_euclid_dist")
+    cloud, options = torch.cat([tracking.cloud, outliers]), {"model_points": "data", "num_model_points": 80}
+    pose, state = after(tracking, cloud, **options)
+    local = cloud - tracking.pose[:3]
+    source = torch.cdist(state.points, local, compute_mode="donot_use_mm_for_euclid_dist")
     assert source.amin(-1).max() == 0
-    assert (fit.distance[0][source.argmin(-1)].abs() < 0.022 * fit.view.problem.size).all()
-    assert len(source.argmin(-1).unique()) == len(points)
-    assert torch.equal(reference, fit.pose[0])
-    torch.testing.assert_close(weights.sum(-1), torch.ones_like(points[:, 0]))
-    assert torch.bincount(weights.argmax(-1)).max() <= 80
-    again = after(tracking, cloud, model_points="data", num_model_points=80)[1]
-    assert torch.equal(again[0], points)
-
-
-def test_parts_without_data_take_the_points_of_the_shape(arm, tracking):
-    body = arm.distance(tracking.cloud, tracking.pose, parts=[1]) > 0.03
-    fit, (points, weights, _) = after(tracking, tracking.cloud[body], model_points="data")
-    on_arm = tracking.skin.weights.argmax(-1) == 1
-    hinged = weights.argmax(-1) == 1
-    torch.testing.assert_close(points[hinged], tracking.skin(fit.pose[0])[on_arm])
-    assert len(points[~hinged]) == body.sum()
-
-
-def test_each_frame_draws_anew(tracking):
-    state = tracking.state()
-    first, later = (
-        after(tracking, tracking.cloud, replace(state, frame=number), model_points="data", num_model_points=30)[1][0]
-        for number in (1, 2)
-    )
-    count = min(len(first), len(later))
-    assert not torch.equal(first[:count], later[:count])
+    chosen = source.argmin(-1)
+    size = (tracking.skin.points.amax(0) - tracking.skin.points.amin(0)).norm()
+    assert (arm.distance(cloud[chosen], pose).abs() < 0.022 * size).all()
+    assert len(chosen.unique()) == len(chosen)
+    torch.testing.assert_close(state.reference_pose[3:], pose[3:])
+    torch.testing.assert_close(state.weights.sum(-1), torch.ones_like(state.points[:, 0]))
+    assert torch.bincount(state.weights.argmax(-1)).max() <= 80
+    begin = tracking.state(num_inliers=float(len(cloud)))
+    again, later = (after(tracking, cloud, replace(begin, frame=number), **options)[1].points for number in (1, 2))
+    assert torch.equal(again, state.points)
+    count = min(len(again), len(later))
+    assert not torch.equal(again[:count], later[:count])
 
 
 def test_data_on_a_rigged_surface_take_the_weights_of_its_nearest_points(arm):
@@ -113,15 +93,3 @@ def test_data_on_a_rigged_surface_take_the_weights_of_its_nearest_points(arm):
     assert len(state.points) > 60
     expected = torch.nn.functional.one_hot((state.points[:, 0] > 0.06).long(), 2).double()
     assert ((state.weights - expected).abs().amax(-1) < 0.5).double().mean() > 0.9
-
-
-def test_as_many_data_as_a_pose_takes_are_enough(tracking, monkeypatch):
-    """With one datum less on the surface all points are kept; so is a datum at the very width."""
-    cloud = one_side(tracking)
-    fitter, state = tracking.fitter(), tracking.state(num_inliers=float(len(cloud)))
-    fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
-    on_surface = int((fit.distance[0].abs() < model_points.WIDTHS.surface * fitter.size).sum())
-    monkeypatch.setattr(model_points, "MIN_DATA", on_surface)
-    assert len(model_points.next_model_points(fitter, state, fit)[0]) < len(fitter.skin)
-    monkeypatch.setattr(model_points, "MIN_DATA", on_surface + 1)
-    assert torch.equal(model_points.next_model_points(fitter, state, fit)[0], fitter.skin.points)

@@ -1,12 +1,13 @@
 """Shape coefficients over time: every frame tells more of them, states go on, and what does not go with a fit."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 import torchreg as tr
-from torchreg.geometry.mesh import sample_surface
+from tests.alignment.made import person_cloud
 
 TRUTH = torch.tensor([0.7, -0.6, 0.9])
 
@@ -20,18 +21,10 @@ def motion(shape, frames):
     return torch.cat([base, time.sin() * swing[0] + (time.cos() - 1) * swing[1]], dim=-1)
 
 
-def scans(shape, poses, coefficients, noise=0.003, count=400):
+def scans(shape, poses, coefficients):
     """Return what a camera at -y sees of a person, with noise and 5 % outliers."""
     generator = torch.Generator().manual_seed(2)
-    clouds = []
-    for pose in poses:
-        mesh = tr.TriangleMesh(shape.vertices(pose, coefficients), shape.surface.faces)
-        points, face, _ = sample_surface(mesh, 4 * count, generator=generator)
-        points = points[mesh.face_normals()[face][:, 1] < -0.1][:count]
-        points = points + noise * torch.randn(points.shape, generator=generator)
-        low, high = points.amin(0) - 0.2, points.amax(0) + 0.2
-        clouds.append(torch.cat([points, low + (high - low) * torch.rand(count // 20, 3, generator=generator)]))
-    return clouds
+    return [person_cloud(shape, pose, coefficients, generator, 400, noise=0.003) for pose in poses]
 
 
 def start_near(poses):
@@ -42,70 +35,59 @@ def start_near(poses):
 
 @pytest.fixture(scope="module")
 def tracked(person):
-    """The tracker of eight frames of a person, and its results."""
+    """The tracker of eight frames of a person, its clouds, results and states."""
     poses = motion(person, 8)
+    clouds = scans(person, poses, TRUTH)
     tracker = tr.Tracker(person, start_near(poses), fit_shape=True)
-    return tracker, [tracker.step(cloud) for cloud in scans(person, poses, TRUTH)]
+    results, states = zip(*((tracker.step(cloud), tracker.state) for cloud in clouds), strict=True)
+    return SimpleNamespace(tracker=tracker, clouds=clouds, results=results, states=states)
 
 
 def test_the_error_of_the_coefficients_falls_with_the_frames(tracked):
-    errors = torch.stack([(result.coefficients - TRUTH).norm() for result in tracked[1]])
-    deviations = torch.stack([result.coefficient_covariance.diagonal().sqrt() for result in tracked[1]])
-    assert all(result.status is tr.Status.CONVERGED for result in tracked[1])
+    errors = torch.stack([(result.coefficients - TRUTH).norm() for result in tracked.results])
+    deviations = torch.stack([result.coefficient_covariance.diagonal().sqrt() for result in tracked.results])
+    assert all(result.status is tr.Status.CONVERGED for result in tracked.results)
     assert float(errors[-1]) < 0.7 * float(errors[0])
     assert float(errors[-1]) < 0.08
     # Information adds up; with the frames it grows in proportion.
     assert bool((deviations.diff(dim=0) < 0).all())
     assert bool((deviations[-1] < 0.7 * deviations[0]).all())
-    assert bool(((tracked[1][-1].coefficients - TRUTH).abs() < 4 * deviations[-1] + 0.02).all())
+    assert bool(((tracked.results[-1].coefficients - TRUTH).abs() < 4 * deviations[-1] + 0.02).all())
 
 
 def test_the_rig_that_is_followed_is_that_of_the_person(tracked, person):
-    tracker = tracked[0]
     rest = torch.zeros(person.num_dofs)
     wanted = person.vertices(rest, TRUTH)
-    assert float((tracker.shape(rest).points - wanted).norm(dim=-1).mean()) < 0.01
+    assert float((tracked.tracker.shape(rest).points - wanted).norm(dim=-1).mean()) < 0.01
     assert float((person(rest).points - wanted).norm(dim=-1).mean()) > 0.03
 
 
-def test_the_pose_of_a_person_just_found_is_not_sought_again(person, monkeypatch):
+def test_a_frame_that_shows_nobody_tells_nobody_and_the_pose_of_one_just_found_is_not_sought_again(person, monkeypatch):
     def no_search(*arguments, **options):
         raise AssertionError("the pose was found together with the person")
 
     monkeypatch.setattr("torchreg.tracking.tracker.align", no_search)
     monkeypatch.setattr("torchreg.tracking.recovery.find_pose", no_search)
     poses = motion(person, 1)
-    result = tr.Tracker(person, start_near(poses), fit_shape=True).step(scans(person, poses, TRUTH)[0])
+    tracker = tr.Tracker(person, start_near(poses), fit_shape=True)
+    nobody = tracker.step(torch.zeros(0, 3))
+    assert (nobody.status, nobody.coefficients) == (tr.Status.NO_DATA, None)
+    result = tracker.step(scans(person, poses, TRUTH)[0])
     assert result.status is tr.Status.CONVERGED
     found = person.vertices(result.pose, result.coefficients)
     assert float((found - person.vertices(poses[0], TRUTH)).norm(dim=-1).mean()) < 0.02
 
 
 def test_a_state_goes_on_in_another_tracker(tracked, person, tmp_path):
-    poses = motion(person, 3)
-    clouds = scans(person, poses, TRUTH)
-    first = tr.Tracker(person, start_near(poses), fit_shape=True)
-    first.run(clouds[:2]).save(tmp_path / "r.safetensors")
-    first.state.save(tmp_path / "s.safetensors")
+    tracked.states[1].save(tmp_path / "s.safetensors")
     second = tr.Tracker(person, fit_shape=True)
     second.state = tr.load(tmp_path / "s.safetensors")
-    found, wanted = (tracker.step(clouds[2]) for tracker in (second, first))
-    torch.testing.assert_close(found.pose, wanted.pose)
-    torch.testing.assert_close(found.coefficients, wanted.coefficients)
-    kept = tr.load(tmp_path / "r.safetensors")
-    assert kept.coefficients.shape == (3,)
-    assert kept.coefficient_covariance.shape == (3, 3)
+    result = second.run(tracked.clouds[2:3])
+    torch.testing.assert_close(result.poses[0], tracked.results[2].pose)
+    torch.testing.assert_close(result.coefficients, tracked.results[2].coefficients)
+    torch.testing.assert_close(result.coefficient_covariance, tracked.results[2].coefficient_covariance)
     with pytest.raises(tr.errors.InputError, match="fit_shape must be the same"):
-        tr.Tracker(person).state = first.state
-
-
-def test_a_frame_that_shows_nobody_tells_nobody(person):
-    tracker = tr.Tracker(person, torch.zeros(person.num_dofs), fit_shape=True)
-    result = tracker.step(torch.zeros(0, 3))
-    assert result.status is tr.Status.NO_DATA
-    assert result.coefficients is None
-    poses = motion(person, 1)
-    assert tracker.step(scans(person, poses, TRUTH)[0]).coefficients.shape == (3,)
+        tr.Tracker(person).state = second.state
 
 
 def test_bones_of_any_rig_are_followed(person):
