@@ -10,6 +10,8 @@ reference, moved by the file's own joints, lie from where they truly are, as med
     python benchmarks/scan_urdf.py
     python benchmarks/scan_urdf.py --fused
     python benchmarks/scan_urdf.py --fused --robot ROBOT.urdf     # a robot of a file, in random steps
+    python benchmarks/scan_urdf.py --around                       # 5,000 points all around, no normals, any order
+    python benchmarks/scan_urdf.py --data FOLDER                  # a hexapod's ten clouds, against its official URDF
 """
 
 from __future__ import annotations
@@ -19,11 +21,14 @@ import math
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from scan_robots import camera_frame
+from scipy.optimize import least_squares, linear_sum_assignment
 from torch import Tensor
 
 import torchreg as tr
@@ -36,6 +41,10 @@ from torchreg.shapes.posed_tree import PosedTree
 from torchreg.shapes.robots import solid_mesh
 
 STEP, SPLITS = 0.25, 3
+# Of clouds all around: points each, and joint angles at random up to so much, radians.
+POINTS, RANGE = 5000, 0.8
+# A joint is right within so many degrees, and so much of the size; of the hexapod so many meters.
+DEGREES, SHARE, METERS = 5.0, 0.02, 0.010
 
 
 @dataclass(frozen=True)
@@ -104,6 +113,103 @@ class Arm:
         frames = self.tree.frame_transforms(self.poses[0])[moving]
         axes = torch.tensor([joints[number].axis for number in moving], dtype=torch.float64)
         return (frames[:, :3, :3] @ axes.unsqueeze(-1)).squeeze(-1), frames[:, :3, 3]
+
+
+def around(arm: Arm, generator: torch.Generator) -> tuple[Arm, list[tr.RangeScan]]:
+    """Return an arm in random poses, and clouds of its whole surface, new points in each, without normals."""
+    values = RANGE * (2 * torch.rand(len(arm.poses), arm.poses.shape[1] - 6, generator=generator).double() - 1)
+    arm = replace(arm, poses=torch.nn.functional.pad(values, (6, 0)))
+    return arm, [tr.RangeScan(scattered(tr.TriangleMesh(frame, arm.faces), generator)) for frame in arm.placed()]
+
+
+def scattered(mesh: tr.TriangleMesh, generator: torch.Generator) -> Tensor:
+    """Return points (N, 3) evenly at random on a mesh."""
+    corners = mesh.vertices[mesh.faces]
+    a, b, c = corners.unbind(1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    chosen = corners[torch.multinomial(area, POINTS, True, generator=generator)]
+    # Exponential variables over their sum are even on a triangle.
+    shares = -torch.rand(POINTS, 3, generator=generator, dtype=torch.float64).log()
+    return (shares.unsqueeze(-1) * chosen).sum(1) / shares.sum(-1, keepdim=True)
+
+
+def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int]:
+    """Print the figures of an arm in clouds all around; return how many joints are right, and how many there are."""
+    arm, scans = around(arm, torch.Generator().manual_seed(seed))
+    begin = time.process_time()
+    found = tr.register_sequence(scans, reference="auto")
+    with tempfile.TemporaryDirectory() as folder:
+        robot = found.to_urdf(Path(folder) / "robot.urdf")
+    spent = time.process_time() - begin
+    size = float((arm.placed()[0].amax(0) - arm.placed()[0].amin(0)).norm())
+    angles, across = axis_errors(replace(arm, poses=arm.poses[found.reference :]), robot)
+    right = (angles < DEGREES) & (across < SHARE * size)
+    print(
+        f"{name}: {int(right.sum())} of {len(right)} joints right, {len(robot.tree) - 1} found, axes off "
+        f"{', '.join(f'{a:.1f}' for a in angles.tolist())} degrees, "
+        f"{', '.join(f'{100 * a / size:.1f}' for a in across.tolist())} % of the size; "
+        f"{found.status}, {spent:.0f} CPU s",
+        flush=True,
+    )
+    return int(right.sum()), len(right)
+
+
+def show_hexapod(folder: Path, generator: torch.Generator | None) -> None:
+    """Print how many joints of the hexapod are right, its clouds in their order or in a random one.
+
+    Nobody knows how it stood, so the official robot's axes are fitted to those found: a missing or wrong one is off.
+    """
+    clouds = torch.from_numpy(np.load(folder / "robot_clouds/hexapod.npz")["points"]).double()
+    order = torch.arange(len(clouds)) if generator is None else torch.randperm(len(clouds), generator=generator)
+    begin = time.process_time()
+    found = tr.register_sequence([tr.RangeScan(cloud) for cloud in clouds[order]], reference="auto")
+    with tempfile.TemporaryDirectory() as output:
+        robot = found.to_urdf(Path(output) / "robot.urdf")
+    spent = time.process_time() - begin
+    # In the first cloud it stands about as in the official file's zero pose.
+    first = robot.motions()[int((order == 0).nonzero())][[joint.parent for joint in robot.tree.joints[1:]]]
+    axes = torch.tensor([joint.axis for joint in robot.tree.joints[1:]], dtype=torch.float64)
+    directions = (first[:, :3, :3] @ axes.unsqueeze(-1)).squeeze(-1)
+    points = (first[:, :3, :3] @ robot.origins()[1:].unsqueeze(-1)).squeeze(-1) + first[:, :3, 3]
+    angles, across = official_errors(folder / "robot_clouds/hexapod_official.urdf", directions, points)
+    right = (angles < DEGREES) & (across < METERS)
+    print(
+        f"hexapod, clouds {order.tolist()}: {int(right.sum())} of {len(right)} joints right, {len(axes)} found; "
+        f"those off {angles[right].median():.1f} degrees, {1000 * across[right].median():.1f} mm in the median; "
+        f"{found.status}, {spent:.0f} CPU s",
+        flush=True,
+    )
+
+
+def official_errors(path: Path, directions: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the angles (J,), degrees, and distances (J,) of a robot's axes from those found, each its own.
+
+    The robot's base and joint values are those for which its axes lie best on the found ones, by robust least squares
+    with assignments in turn.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        shape = tr.ArticulatedShape.from_urdf(path, dtype=torch.float64, with_surface=False)
+    arm = Arm(shape, torch.empty(0, 3), torch.empty(0, 3), torch.empty(0), shape.rest.unsqueeze(0))
+
+    def errors(pose: np.ndarray) -> tuple[Tensor, Tensor]:
+        axes, origins = replace(arm, poses=torch.from_numpy(pose).unsqueeze(0)).axes()
+        off = points - origins.unsqueeze(1)
+        across = (off - (off * axes.unsqueeze(1)).sum(-1, keepdim=True) * axes.unsqueeze(1)).norm(dim=-1)
+        return torch.linalg.cross(axes.unsqueeze(1), directions.expand_as(off)).norm(dim=-1).arcsin(), across
+
+    pose = shape.rest.numpy().copy()
+    for width in (0.04, 0.02, 0.01, 0.01, 0.01):
+        angle, across = errors(pose)
+        own = linear_sum_assignment((0.1 * angle + across).clamp_max(5 * width))
+
+        def residuals(pose: np.ndarray, own: tuple[np.ndarray, np.ndarray] = own) -> np.ndarray:
+            angle, across = errors(pose)
+            return torch.cat([0.1 * angle[own], across[own]]).numpy()
+
+        pose = least_squares(residuals, pose, loss="cauchy", f_scale=width).x
+    angle, across = errors(pose)
+    return torch.rad2deg(angle[own]), across[own]
 
 
 def fused(placed: Tensor, faces: Tensor, generator: torch.Generator) -> tuple[list[tr.RangeScan], Tensor]:
@@ -207,8 +313,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--joints", type=int, nargs="+", default=[3, 5, 7], help="of the arms")
     parser.add_argument("--fused", action="store_true", help="clouds of four depth cameras instead of whole surfaces")
     parser.add_argument("--robot", type=Path, help="URDF file of a robot to scan instead of made-up arms")
+    parser.add_argument(
+        "--around", action="store_true", help="clouds of the whole surface, without normals, in any order"
+    )
+    parser.add_argument("--data", type=Path, help="folder of robot_clouds: its hexapod")
+    parser.add_argument("--shuffled", action="store_true", help="the hexapod's clouds in a random order")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of a robot's steps")
     options = parser.parse_args(arguments)
+    if options.data:
+        for seed in options.seeds:
+            show_hexapod(options.data, torch.Generator().manual_seed(seed) if options.shuffled else None)
+        return 0
+    if options.around:
+        counts = []
+        for seed in options.seeds:
+            for joints in options.joints:
+                arm = Arm.drawn(joints, options.frames, seed=seed + joints)
+                counts.append(show_around(arm, f"{joints} joints, seed {seed}", seed))
+        print("{} of {} joints right".format(*map(sum, zip(*counts, strict=True))))
+        return 0
     if options.robot:
         for seed in options.seeds:
             arm = Arm.of_file(options.robot, options.frames, seed)

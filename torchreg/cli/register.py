@@ -38,7 +38,7 @@ def register(
         typer.Argument(
             metavar="SOURCE TARGET",
             help="Scan to be moved (.ply, .obj, .npz, ...), in any unit, and scan to be reached, in the same unit and "
-            "frame; or a folder or pattern of the two. With --urdf, any number of scans of one robot, in metres.",
+            "frame; or a folder or pattern of the two. With --urdf, any number of scans of one robot, in metres, in any order.",
         ),
     ],
     output: Annotated[
@@ -82,7 +82,8 @@ def register(
         typer.Option(
             "--urdf",
             help="Write what was scanned as a robot: OUT.urdf, a mesh of each link in OUT_meshes, the joint values of "
-            "every scan in OUT_joints.csv and the registration in OUT.safetensors.",
+            "every scan in OUT_joints.csv and the registration in OUT.safetensors. The scan most like the others has "
+            "joint values of zero.",
         ),
     ] = False,
     force: Force = False,
@@ -199,7 +200,7 @@ def _write_robot(
     check_outputs([urdf, result, result.with_suffix(".json"), table], force)
     scans = read(1)
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
-        found = register_sequence(scans, bones, grid, on_step=partial(_show, bar))
+        found = register_sequence(scans, bones, grid, on_step=partial(_show, bar), reference="auto")
     found.save(result)
     with OptionalOutput(urdf):
         robot = save_robot(urdf, Source([found], names=[path.name for path in paths]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.problem import ExpectedPlaces
 from torchreg.registration.dense.reliability import SCAN_CALIBRATION, confidence_onward
+from torchreg.registration.frame_tree import FrameTree
 from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import (
     check_inputs,
@@ -123,7 +125,7 @@ def register_sequence(
     generator: torch.Generator | None = None,
     on_step: OnRegisterStep | None = None,
     *,
-    reference: int = 0,
+    reference: int | Literal["auto"] = 0,
 ) -> SequenceRegistration:
     """Return one set of bones and weights that takes a reference scan onto all scans, and what all of them show.
 
@@ -140,7 +142,8 @@ def register_sequence(
         config: see `RegisterConfig`.
         generator: source of randomness; None draws the same numbers at every call.
         on_step: called with a `RegisterRecord` after each step.
-        reference: number of the scan that is moved.
+        reference: number of the scan that is moved, from which the others are reached in turn; "auto" for scans in any
+            order takes the one most like the others, and reaches each scan from that most like it.
 
     Returns:
         a `SequenceRegistration`.
@@ -171,18 +174,25 @@ def register_sequence(
     for scan in scans:
         check_inputs((scan, scan), num_bones, grid_resolution)
     warn_about_rounding(scans[0].points, "points of scans", scans[0].diagonal, stacklevel=4)
-    check_count(reference, "reference", 0)
-    if reference >= len(scans):
-        raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
+    if reference != "auto":
+        check_count(reference, "reference", 0)
+        if reference >= len(scans):
+            raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
     origin = far_origin([scan.points for scan in scans])
     scans = tuple(to_local(scan, origin) for scan in scans)
     degenerate = warn_about_flat_scans(scans, stacklevel=4)
     warn_about_units(scans, [f"scans[{number}]" for number in range(len(scans))], stacklevel=4)
+    tree = (
+        FrameTree.alike([scan.points for scan in scans])
+        if reference == "auto"
+        else FrameTree.in_turn(reference, len(scans))
+    )
+    reference = tree.order[0]
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
     moved, confidence, sure = _aligned_frames(
-        scans, reference, num_bones, grid_resolution, config, generator=generator, on_step=on_step
+        scans, tree, num_bones, grid_resolution, config, generator=generator, on_step=on_step
     )
     normalized = [normalization.normalize_scan(scan) for scan in scans]
     normalized_source, config = normalized[reference], ALL_FRAMES.apply(config)
@@ -199,7 +209,7 @@ def register_sequence(
 
 def _aligned_frames(
     scans: tuple[RangeScan, ...],
-    reference: int,
+    tree: FrameTree,
     num_bones: int,
     grid_resolution: int,
     config: RegisterConfig,
@@ -211,30 +221,28 @@ def _aligned_frames(
 
     They come from the dense alignments, in which small parts move that the few bones cannot represent.
     """
-    source, few_bones = scans[reference], FRAME_TO_FRAME.apply(config)
+    few_bones = FRAME_TO_FRAME.apply(config)
+    reference = tree.order[0]
+    source = scans[reference]
     aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source)).to(source.points)}
-    deformed, sure = {reference: source.points}, torch.ones(len(scans)).to(source.points)
-    for step, end in ((1, len(scans)), (-1, -1)):
-        current = source
-        for frame in range(reference + step, end, step):
-            found = align_scans(
-                current, scans[frame], config.align,
-                generator=generator, on_step=initial_records(on_step),
-                expected=MOTION.predict(
-                    [deformed[past] for past in range(reference, frame, step)], confidence[frame - step]
-                ),
-            )  # fmt: skip
-            aligned[frame], confidence[frame] = found.points, found.point_confidence
-            sure[frame] = confidence_onward(float(sure[frame - step]), found.confidence)
-            if frame + step == end:
-                break
-            bent = register(
-                source, scans[frame], num_bones, grid_resolution, few_bones, generator,
-                start=found.points, confidence=found.point_confidence,
-            )  # fmt: skip
-            deformed[frame] = bent.deformed
-            normals = turned_normals(source.normals, bent.weights, bent.transforms)
-            current = RangeScan(bent.deformed, source.faces, normals)
+    deformed, sure = {reference: source}, torch.ones(len(scans)).to(source.points)
+    for frame in tree.order[1:]:
+        parent = tree.parents[frame]
+        found = align_scans(
+            deformed[parent], scans[frame], config.align,
+            generator=generator, on_step=initial_records(on_step),
+            expected=MOTION.predict([deformed[past].points for past in tree.path(parent)], confidence[parent]),
+        )  # fmt: skip
+        aligned[frame], confidence[frame] = found.points, found.point_confidence
+        sure[frame] = confidence_onward(float(sure[parent]), found.confidence)
+        if frame not in tree.parents:
+            continue
+        bent = register(
+            source, scans[frame], num_bones, grid_resolution, few_bones, generator,
+            start=found.points, confidence=found.point_confidence,
+        )  # fmt: skip
+        normals = turned_normals(source.normals, bent.weights, bent.transforms)
+        deformed[frame] = RangeScan(bent.deformed, source.faces, normals)
     frames = range(len(scans))
     points, confident = ([each[frame] for frame in frames] for each in (aligned, confidence))
     return torch.stack(points), torch.stack(confident).cpu(), sure

@@ -230,7 +230,7 @@ class SequenceRegistration(Result):
 
         Which points are one link, and whether two links turn about an axis, slide or hold together, is decided by how
         well their motions explain the scans, each parameter paying for itself; axes and joint values are then fitted to
-        all scans together. The zero pose is the reference scan; each link has its triangles in PATH_meshes, beside the
+        all scans together, each compared with what the others show of the same link. The zero pose is the reference scan; each link has its triangles in PATH_meshes, beside the
         file, or without triangles a closed surface about what all scans show of it. Limits are those of the motions
         that were seen. Scans must be in metres. A joint that turns a round part about its own axis cannot be seen.
 
@@ -248,7 +248,7 @@ class SequenceRegistration(Result):
 
         Differentiable: no.
 
-        Cost: 5 to 20 s for ten scans.
+        Cost: 10 to 35 s for ten scans.
 
         References: Isack and Boykov 2012; Schwarz 1978; Chow and Liu 1968.
         """

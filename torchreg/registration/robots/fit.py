@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from torchreg.geometry.rigid import adjoint, se3_exp
 from torchreg.geometry.rotation import skew
-from torchreg.registration.robots.surfaces import Noise, Surfaces
+from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,19 @@ class FitNumbers:
 
 
 FIT = FitNumbers()
+
+
+class HasBlocks(Protocol):
+    """Data with normal equations of the motions of parts: samples and scans, or scans among each other."""
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the samples."""
+        ...
+
+    def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
+        """Return the normal equations at the motions (T, K, 4, 4) of parts (n,)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +79,7 @@ class Mechanism:
 
 
 def fitted(
-    surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
+    surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
 ) -> Mechanism:
     """Return the mechanism after a Gauss-Newton step of point-to-plane residuals at each of some robust scales."""
     for scale in scales:
@@ -85,7 +99,7 @@ class _System:
     hold: Tensor
 
     @classmethod
-    def of(cls, surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
+    def of(cls, surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
         motions = mechanism.motions()
         blocks = surfaces.blocks(motions, label, scale)
         frames, size = mechanism.values.shape
@@ -114,7 +128,7 @@ class _System:
         return solved, self.outer - (self.mixed.mT @ solved[..., :-1]).sum(0) + torch.diag(self.hold)
 
 
-def _step(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
+def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
     size = mechanism.values.shape[1]
     system = _System.of(surfaces, mechanism, label, scale)
     if not axes:
@@ -127,7 +141,7 @@ def _step(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float,
 
 
 def axis_stds(
-    surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
+    surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
     _, reduced = _System.of(surfaces, mechanism, label, FIT.scales[-1] * noise.sigma).eliminated()
@@ -155,12 +169,12 @@ def _from_neighbors(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noi
     """Return the mechanism with each frame's pose that of least cost: its own, or one found from a frame beside it."""
     scales = [share * surfaces.size for share in FIT.wide] + [scale * noise.sigma for scale in FIT.scales[2:]]
     kernel = FIT.scales[0] * noise.sigma
-    best, cost = mechanism, surfaces.cost(mechanism.motions(), label, kernel)
+    best, cost = mechanism, surfaces.cost(mechanism.motions(), label, kernel).sum(-1)
     for shift in (1, -1):
         order = (torch.arange(len(mechanism.values)) + shift).clamp(0, len(mechanism.values) - 1)
         start = replace(best, base=best.base[order], values=best.values[order])
         found = fitted(surfaces, start, label, scales, axes=False)
-        new = surfaces.cost(found.motions(), label, kernel)
+        new = surfaces.cost(found.motions(), label, kernel).sum(-1)
         better = new < cost
         base = torch.where(better[:, None, None], found.base, best.base)
         best = replace(best, base=base, values=torch.where(better[:, None], found.values, best.values))

@@ -19,7 +19,8 @@ class LinkNumbers:
 
     rounds: int = 6  # of labels and motions; most end by themselves
     splits: int = 2  # of the rounds, in which pieces of parts are proposals too
-    piece: int = 80  # samples of a piece, about
+    piece: int = 40  # samples of a piece, about: a third of the smallest links of ten to twenty
+    wide: tuple[float, ...] = (0.04, 0.025, 0.015, 0.01)  # of the thing's size: how far a piece may be from its part
     scales: tuple[float, ...] = (4.0, 3.0, 3.0)  # of robust kernels of the motions' steps, standard deviations
 
 
@@ -55,27 +56,33 @@ def without_gaps(motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
     return motions[:, used], label
 
 
-def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor, *, split: bool) -> tuple[Tensor, Tensor, Noise]:
+def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor, Noise]:
     """Return motions (T, K, 4, 4) and labels (n,) of links, and the noise: proposals, labels and motions in turn."""
-    splits = LINKS.splits if split else 0
     free = 6.0 * len(surfaces.targets)
     for number in range(LINKS.rounds):
         before, noise = label, surfaces.noise(motions, label)
         scales = [scale * noise.sigma for scale in LINKS.scales]
         motions = surfaces.refined(motions, label, scales)
         proposals = motions
-        if number < splits:
+        if number < LINKS.splits:
             proposals = torch.cat([motions, _pieces(surfaces, motions, label, scales)], 1)
         noise = surfaces.noise(motions, label)
         motions, label = without_gaps(proposals, labeled(surfaces, proposals, label, noise, free))
-        if number >= splits and torch.equal(before, label):
+        if number >= LINKS.splits and torch.equal(before, label):
             break
     return motions, label, noise
 
 
 def _pieces(surfaces: Surfaces, motions: Tensor, label: Tensor, scales: list[float]) -> Tensor:
-    """Return the motions (T, G, 4, 4) of pieces of all parts, each fitted by itself."""
+    """Return the motions (T, G, 4, 4) of pieces of all parts, each fitted by itself.
+
+    In each frame that of less cost: from its part's motion, or by a kernel that narrows, for links of their own.
+    """
     seeds = surfaces.samples[: max(1, len(surfaces.samples) // LINKS.piece)]
     nearest = NeighborTree(seeds).nearest(surfaces.samples)[0]
     key, piece = (nearest * motions.shape[1] + label).unique(return_inverse=True)
-    return surfaces.refined(motions[:, key % motions.shape[1]], piece, scales)
+    start = motions[:, key % motions.shape[1]]
+    near = surfaces.refined(start, piece, scales)
+    far = surfaces.refined(start, piece, [share * surfaces.size for share in LINKS.wide] + scales)
+    better = surfaces.cost(far, piece, scales[0]) < surfaces.cost(near, piece, scales[0])
+    return torch.where(better[..., None, None], far, near)

@@ -20,7 +20,8 @@ from torchreg.geometry.poisson_disk import poisson_disk
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
-from torchreg.registration.robots.fit import Mechanism, axis_stds, settled
+from torchreg.registration.robots.fit import Mechanism, axis_stds, fitted, settled
+from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.joints import Candidate, best_joint, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
@@ -33,6 +34,8 @@ class ModelNumbers:
 
     samples: int = 2500  # of the reference
     rounds: int = 2  # of links, joints and the fit of all; a third changes nothing on scans of arms
+    fusions: int = 6  # of all scans to one surface, and fits to it: the axes of later ones change by tenths of degrees
+    kernels: tuple[float, ...] = (5.0, 4.0, 3.0, 3.0)  # of each fit, standard deviations
     thinned: float = 0.5  # of a scan's spacing, between points of a surface that is made of all scans
     unsure: float = 0.087  # standard deviation of an axis that the scans do not determine, radians: five degrees
     margin: float = 0.05  # beyond the motions seen, that limits allow, radians, or shares of the diagonal
@@ -96,7 +99,8 @@ def find_robot(
     Parts, and pieces of them, propose motions; samples take those of least description length. Two links that touch
     hold together, turn, slide or move freely, by the criterion of Schwarz on what the data hold of their relative
     motions; those that hold together are one. The joints of most evidence make a tree, whose axes and values are fitted
-    to all scans together; links and joints are then looked for once more from there.
+    to all scans together; links and joints are then looked for once more from there. Last, the surface that all scans
+    show of the links takes the place of the reference's own samples.
 
     ``part``: (N,) labels of bones, at least as many as links that registration tells apart (Isack and Boykov 2012 for
     the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most evidence).
@@ -112,21 +116,41 @@ def find_robot(
     order = even_order(points, min(len(points), MODEL.samples))
     surfaces = Surfaces.of(points[order], normals[order], [scans[frame] for frame in frames.tolist()])
     motions, label = without_gaps(moved[frames], part[order])
-    for number in range(MODEL.rounds):
-        motions, label, noise = find_links(surfaces, motions, label, split=number == 0)
+    for _ in range(MODEL.rounds):
+        motions, label, noise = find_links(surfaces, motions, label)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
         mechanism, label = assembled(surfaces, motions, label, joints)
         mechanism = settled(surfaces, mechanism, label, noise)
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
+    fused, mechanism = compared_with_each_other(scans, surfaces, mechanism, label, frames)
+    motions = mechanism.motions()
     loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
     found = _described(mechanism, points, link, frames, residuals, loose)
-    axis, origin = axis_stds(surfaces, mechanism, label, noise, found.origins())
+    axis, origin = axis_stds(fused, mechanism, label, fused.noise(motions), found.origins())
     return replace(found, axis_std=axis[1:], origin_std=origin[1:])
+
+
+def compared_with_each_other(
+    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor, frames: Tensor
+) -> tuple[FusedScans, Mechanism]:
+    """Return all scans on the links (n,) of samples, and the mechanism fitted to what each scan shows with the others.
+
+    ``frames``: numbers of the mechanism's frames among the T scans; the one left out is the reference.
+    """
+    (reference,) = set(range(len(scans))) - set(frames.tolist())
+    motions = torch.eye(4, dtype=torch.float64).repeat(len(scans), len(mechanism.parents), 1, 1)
+    for _ in range(MODEL.fusions):
+        motions[frames] = mechanism.motions()
+        moved = surfaces.moved(motions[:, label])[0]
+        fused = FusedScans.of(scans, moved, label, motions, surfaces.size, reference)
+        sigma = fused.noise(motions[frames]).sigma
+        mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
+    return fused, mechanism
 
 
 def without_welds(

@@ -72,6 +72,24 @@ class Blocks:
     centers: Tensor  # (T, K, 3)
     count: Tensor  # (T, K) samples that count
 
+    @classmethod
+    def of(cls, sums: Tensor, centers: Tensor) -> Blocks:
+        """Return the equations of the sums (T, K, 43) of `frame_sums` in T frames about the centers (T, K, 3)."""
+        return cls(sums[..., :36].unflatten(-1, (6, 6)), sums[..., 36:42], centers, sums[..., 42])
+
+
+def frame_sums(arms: Tensor, facing: Tensor, across: Tensor, square: Tensor, label: Tensor, size: int) -> Tensor:
+    """Return the robustly weighted sums (K, 43) of a frame: of outer products of the Jacobian, its residuals, counts.
+
+    ``arms`` (n, 3) from the centers of the parts (n,) to their points, ``facing`` normals (n, 3), residuals ``across``
+    them (n,), and the squares (n,) that weigh them, in squared kernel widths.
+    """
+    jacobian = torch.cat([facing, torch.linalg.cross(arms, facing)], -1)
+    outer = (jacobian.unsqueeze(-1) * jacobian.unsqueeze(-2)).flatten(-2)
+    values = torch.cat([outer, jacobian * across.unsqueeze(-1), torch.ones_like(across).unsqueeze(-1)], -1)
+    weight = geman_mcclure_weight(square).unsqueeze(-1)
+    return values.new_zeros(size, values.shape[-1]).index_add(0, label, weight * values)
+
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
@@ -142,20 +160,16 @@ class Surfaces:
         for target, frame, center in zip(self.targets, motions, centers, strict=True):
             points, normals = self.moved(frame[label])
             across, facing, square = target.residuals(points, normals, NUMBERS.reach * scale)
-            weight = geman_mcclure_weight(square / scale**2)
-            jacobian = torch.cat([facing, torch.linalg.cross(points - center[label], facing)], -1)
-            outer = (jacobian.unsqueeze(-1) * jacobian.unsqueeze(-2)).flatten(-2)
-            values = torch.cat([outer, jacobian * across.unsqueeze(-1), torch.ones_like(across).unsqueeze(-1)], -1)
-            rows.append(values.new_zeros(size, 43).index_add(0, label, weight.unsqueeze(-1) * values))
-        sums = torch.stack(rows)
-        return Blocks(sums[..., :36].unflatten(-1, (6, 6)), sums[..., 36:42], centers, sums[..., 42])
+            rows.append(frame_sums(points - center[label], facing, across, square / scale**2, label, size))
+        return Blocks.of(torch.stack(rows), centers)
 
     def cost(self, motions: Tensor, label: Tensor, scale: float) -> Tensor:
-        """Return the robust cost (T,) of the samples' squared residuals, in squared scales."""
+        """Return the robust costs (T, K) of the parts' squared residuals, in squared scales."""
         rows = []
         for target, frame in zip(self.targets, motions, strict=True):
             square = target.residuals(*self.moved(frame[label]), NUMBERS.reach * scale)[2]
-            rows.append(geman_mcclure_loss((square / scale**2).clamp_max(1e12)).sum())
+            loss = geman_mcclure_loss((square / scale**2).clamp_max(1e12))
+            rows.append(loss.new_zeros(motions.shape[1]).index_add(0, label, loss))
         return torch.stack(rows)
 
     def travel(self, motions: Tensor, label: Tensor) -> Tensor:

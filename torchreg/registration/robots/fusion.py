@@ -1,0 +1,131 @@
+"""The surface that all scans of a mechanism show together, with which each scan is compared anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.neighbors import NeighborTree, k_nearest_others
+from torchreg.geometry.normals import fit_normals
+from torchreg.geometry.rigid import invert_rigid
+from torchreg.registration.robots.surfaces import NUMBERS, Blocks, Noise, Target, frame_sums
+
+
+@dataclass(frozen=True)
+class FusionNumbers:
+    """Of the surface of all scans."""
+
+    neighbors: int = 24  # of a point, to which a plane is fitted: in ten scans as far as two or three of one scan
+    apart: float = 10.0  # of the thing's size, between links as a coordinate: more than any distance in space
+
+
+FUSION = FusionNumbers()
+
+
+@dataclass(frozen=True, eq=False)
+class FusedScans:
+    """The points of T scans in the pose of a reference, each compared with those of the other scans on its own link.
+
+    One scan's points lie far apart, so that planes through them miss round and small parts by as much as their noise;
+    all scans together are dense. Neighbors are nearest in place, normal and link at once.
+
+    Args:
+        scans: of the T frames.
+        links: T tensors of the links of their points.
+        trees: T trees of the points of the other frames.
+        points: T tensors of those points, in the reference.
+        normals: T tensors of their normals.
+        centers: (K, 3) of the links in the reference.
+        size: diagonal of the samples, the unit of angles.
+    """
+
+    scans: Sequence[Target]
+    links: Sequence[Tensor]
+    trees: Sequence[NeighborTree]
+    points: Sequence[Tensor]
+    normals: Sequence[Tensor]
+    centers: Tensor
+    size: float
+
+    @classmethod
+    def of(
+        cls, scans: Sequence[Target], moved: Tensor, label: Tensor, motions: Tensor, size: float, reference: int
+    ) -> FusedScans:
+        """Return the scans of all frames but the reference, whose pose stays, to compare with all.
+
+        A point belongs to the link of the nearest of the moved samples (F, n, 3), which are those of the links (n,);
+        the motions (F, K, 4, 4) of links pull it back.
+        """
+        links = [label[NeighborTree(own).nearest(scan.points)[0]] for scan, own in zip(scans, moved, strict=True)]
+        pulled = [_pulled_back(*row) for row in zip(scans, links, motions, strict=True)]
+        points, normals, link = (
+            torch.cat([row[0] for row in pulled]),
+            torch.cat([row[1] for row in pulled]),
+            torch.cat(links),
+        )
+        frame = torch.arange(len(scans)).repeat_interleave(torch.tensor([len(own) for own in links]))
+        spacing = sum(scan.spacing for scan in scans) / len(scans)
+        fitted = fit_normals(
+            points, k_nearest_others(_place(points, normals, link, spacing, size), FUSION.neighbors)[0]
+        )
+        normals = torch.where((fitted * normals).sum(-1, keepdim=True) < 0, -fitted, fitted)
+        place = _place(points, normals, link, spacing, size)
+        member = torch.nn.functional.one_hot(link, motions.shape[1]).to(points)
+        kept = [number for number in range(len(scans)) if number != reference]
+        others = [frame != number for number in kept]
+        return cls(
+            scans=[scans[number] for number in kept],
+            links=[links[number] for number in kept],
+            trees=[NeighborTree(place[other]) for other in others],
+            points=[points[other] for other in others],
+            normals=[normals[other] for other in others],
+            centers=(member.mT @ points) / member.sum(0).clamp_min(1).unsqueeze(-1),
+            size=size,
+        )
+
+    def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
+        """Return the normal equations of robust residuals at the motions (T, K, 4, 4); see `Surfaces.blocks`."""
+        centers = (motions[..., :3, :3] @ self.centers.unsqueeze(-1)).squeeze(-1) + motions[..., :3, 3]
+        rows = []
+        for frame, (motion, center) in enumerate(zip(motions, centers, strict=True)):
+            points, facing, across, square = self._residuals(frame, motion)
+            link = self.links[frame]
+            rows.append(frame_sums(points - center[link], facing, across, square / scale**2, link, motions.shape[1]))
+        return Blocks.of(torch.stack(rows), centers)
+
+    def noise(self, motions: Tensor) -> Noise:
+        """Return the noise of the residuals under the motions (T, K, 4, 4)."""
+        squares = torch.cat([self._residuals(frame, motion)[3] for frame, motion in enumerate(motions)])
+        least = NUMBERS.roughness * sum(scan.spacing for scan in self.scans) / len(self.scans)
+        return Noise(max(NUMBERS.to_deviation * float(squares.sqrt().median()), least), 1.0)
+
+    def _residuals(self, frame: int, motions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the moved points of the surface nearest to a frame's points, their normals, and residuals of both.
+
+        As of `Target.residuals`: across the plane, and squared with what is along it beyond the spacing.
+        """
+        scan, link = self.scans[frame], self.links[frame]
+        points, normals = _pulled_back(scan, link, motions)
+        nearest = self.trees[frame].nearest(_place(points, normals, link, scan.spacing, self.size))[0]
+        turn = motions[link]
+        moved = (turn[:, :3, :3] @ self.points[frame][nearest].unsqueeze(-1)).squeeze(-1) + turn[:, :3, 3]
+        facing = (turn[:, :3, :3] @ self.normals[frame][nearest].unsqueeze(-1)).squeeze(-1)
+        offset = moved - scan.points
+        across = (offset * facing).sum(-1)
+        along = (offset.square().sum(-1) - across.square()).clamp_min(0).sqrt()
+        return moved, facing, across, across.square() + (along - scan.spacing).clamp_min(0).square()
+
+
+def _pulled_back(scan: Target, link: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the points and normals (M, 3) of a scan in the reference, by the motions (K, 4, 4) of their links (M,)."""
+    back = invert_rigid(motions)[link]
+    turned = (back[:, :3, :3] @ scan.normals.unsqueeze(-1)).squeeze(-1)
+    return (back[:, :3, :3] @ scan.points.unsqueeze(-1)).squeeze(-1) + back[:, :3, 3], turned
+
+
+def _place(points: Tensor, normals: Tensor, link: Tensor, spacing: float, size: float) -> Tensor:
+    """Return coordinates (N, 7) in which points of opposite sides are a spacing apart, and links very far."""
+    return torch.cat([points, spacing * normals, FUSION.apart * size * link.to(points).unsqueeze(-1)], -1)
