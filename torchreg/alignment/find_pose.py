@@ -12,21 +12,21 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
 from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.inputs import (
-    Observation,
+    Task,
     check_clouds,
     check_skin,
-    floating_origin,
     warn_about_degenerate,
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.search.in_picture import surest_crop
-from torchreg.alignment.search.landmark_fit import find_keypoints, measured_alone
+from torchreg.alignment.search.landmark_fit import KeypointRows, find_keypoints
 from torchreg.alignment.search.limb_search import distinct_first, take_rows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.pose_search import PoseSearch, mean_distances
@@ -35,11 +35,11 @@ from torchreg.alignment.search.start_source import StartSource
 from torchreg.alignment.search.whole_alignment import align_rows, best_distinct, best_first, fit_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
-from torchreg.geometry.far_origin import to_local, to_world
+from torchreg.geometry.far_origin import to_world
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import SkinSurface
 
 
@@ -154,54 +154,45 @@ def find_pose(
     """
     check_count(num_starts, "num_starts", 1)
     config = config or FindPoseConfig()
-    source = StartSource.of(shape, sources, initializer, config.upright)
-    if data is None or isinstance(data, Camera):
-        points = model_points or sample_skin(shape, config.num_model_points)
-        measured = measured_alone(shape, data, keypoints, keypoint_std)
-        return find_keypoints(shape, points, measured, num_starts, KnownDofs.of(shape, locked, prior))
+    source, known = StartSource.of(shape, sources, initializer, config.upright), KnownDofs.of(shape, locked, prior)
+    model = AlignConfig(num_model_points=config.num_model_points)
+    skin = None if model_points is None else check_skin(shape, model_points)
+    task = Task(shape=shape, model_points=skin, known=known, source=source, config=model)
+
+    def found(data: Any, mask: Tensor | None = None) -> PoseStarts:
+        asked = task.observed(data, mask, keypoints, keypoint_std)
+        if asked.seen.points is None:
+            return find_keypoints(KeypointRows.of(task.skin(), asked.seen.keypoints, None, known), num_starts)
+        starts = search_everywhere(asked, num_starts, config).starts
+        return replace(starts, poses=to_world(starts.poses, asked.seen.origin), shape=shape)
+
     if isinstance(data, DepthFrame) and data.mask is None:
-        skin = model_points or sample_skin(shape, config.num_model_points)
-        search = partial(
-            find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
-            locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
-        )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.crop_score, skin))[0]
-    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
-    origin = floating_origin(shape, seen.points)
-    seen, known = to_local(seen, origin), to_local(KnownDofs.of(shape, locked, prior), origin)
-    starts = search_everywhere(shape, seen, num_starts, source, model_points, config, known).starts
-    return replace(starts, poses=to_world(starts.poses, origin), shape=shape)
+        skin = task.skin()
+        task = replace(task, model_points=skin)
+        return surest_crop(data, model_size(skin), found, partial(source.crop_score, skin))[0]
+    return found(data, mask)
 
 
-def search_everywhere(
-    shape: ArticulatedShape,
-    seen: Observation,
-    num_starts: int,
-    source: StartSource,
-    model_points: LinearBlendSkin | None,
-    config: FindPoseConfig,
-    known: KnownDofs | None = None,
-) -> FoundStarts:
+def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> FoundStarts:
     """Return what `find_pose` finds in data near the origin."""
-    seen = seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
+    shape, known = task.shape, task.known
+    seen = task.seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
     with torch.no_grad():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
         origin = masked_mean(batch, batch_valid)
         typical = shifted(bent_pose(shape, _CANDIDATES.typical).expand(len(batch), -1), origin)
-        count = config.num_model_points
-        skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
         problem = centered_problem(
-            skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
+            task.skin(), batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
             free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
             problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
-        warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
-        warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
-        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
+        warn_about_rounding(clouds, "data", problem.size, stacklevel=4)
+        warn_about_units(problem.data, problem.valid, problem.size, stacklevel=4)
+        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=4)
         with one_thread():
-            poses, costs = _find(problem, seen.frames, source.with_known(known), config)
+            poses, costs = _find(problem, seen.frames, task.source.with_known(known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
