@@ -8,7 +8,8 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import TIPS, generator, hinge, joint, off, problem_of, shape_of, solid
-from torchreg.alignment.search.limb_search import Effort, LimbSearch, distinct_first
+from torchreg.alignment.search.limb_search import Effort, LimbSearch
+from torchreg.alignment.search.multi_start import distinct_first
 
 THOROUGH = Effort(
     num_data=400, width=0.05, beam=80, configurations=30, refine_widths=(0.04, 0.03, 0.025), score_width=0.02,

@@ -7,7 +7,8 @@ import torch
 
 from tests.alignment.made import TIPS, generator, off, problem_of
 from torchreg.alignment.search.local_search import explore, needs_search
-from torchreg.alignment.search.pose_search import PoseSearch, score_candidates
+from torchreg.alignment.search.multi_start import score_candidates
+from torchreg.alignment.search.pose_search import PoseSearch
 
 
 @pytest.fixture(scope="module")

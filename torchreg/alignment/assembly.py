@@ -13,7 +13,7 @@ from torchreg.alignment.fit.annealed_em import outlier_level
 from torchreg.alignment.fit.problem import INLIER_SHARE, alignment_cost
 from torchreg.alignment.inputs import warn_about_degenerate
 from torchreg.alignment.results import AlignResult
-from torchreg.alignment.search.pose_search import mean_distances
+from torchreg.alignment.search.multi_start import mean_distances
 from torchreg.geometry.budget import BUDGET
 from torchreg.result import Status
 from torchreg.shapes.pose_algebra import shifted

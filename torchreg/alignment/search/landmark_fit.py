@@ -16,8 +16,7 @@ from torchreg.alignment.fit.objectives import Objective
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_problem
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
-from torchreg.alignment.search.limb_search import distinct_first
-from torchreg.alignment.search.pose_search import mean_distances
+from torchreg.alignment.search.multi_start import Candidates
 from torchreg.alignment.search.rough_poses import bent_pose, spread_rotations, typical_poses
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_log
@@ -106,12 +105,9 @@ class KeypointRows:
 
     def finished(self) -> KeypointRows:
         """Return the rows, best first, duplicates of better ones last."""
-        order = self.costs.argsort()
-        poses, costs = self.poses[order], self.costs[order]
-        apart = mean_distances(self.problem, poses[None])[0] > _SEARCH.same * self.problem.size
-        lead = torch.where(apart[0], costs, torch.inf).amin() - costs[0]
-        first = distinct_first(~apart[None])[0]
-        return replace(self, poses=poses[first], costs=costs[first], lead=lead)
+        ranked = Candidates.ranked(self.problem, self.poses[None], self.costs[None])
+        first = ranked.distinct(_SEARCH.same)
+        return replace(self, poses=first.poses[0], costs=first.costs[0], lead=ranked.lead(_SEARCH.same)[0])
 
     def judged(self) -> AlignResult:
         """Return the alignment of the first row; it has no data."""
