@@ -16,10 +16,12 @@ from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.found_frames import FramePoses
-from torchreg.alignment.inputs import check_clouds
+from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.results import Calibration
+from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.shape.person_rows import fit_scans
 from torchreg.alignment.shape.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
-from torchreg.alignment.shape.shape_fit import fit_coefficients, shared_covariance
+from torchreg.alignment.shape.shape_fit import shared_covariance
 from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
@@ -191,7 +193,10 @@ def _calibrate_person(
     if frame_poses.searched:
         frame_poses = frame_poses.of_person(shape, data, valid, config.align)
     counts = frame_poses.known | ~frame_poses.known.any()
-    fitted = fit_coefficients(shape, data[counts], valid[counts], frame_poses.poses[counts], config=config.align)
+    task = Task(
+        shape=shape, source=StartSource.of(shape), config=config.align, start=frame_poses.poses[counts]
+    )  # fmt: skip
+    fitted = fit_scans(task, data[counts], valid[counts])
     poses = frame_poses.poses.index_put((counts,), fitted.poses)
     frame_poses.warn()
     person = shape.with_coefficients(fitted.coefficients)

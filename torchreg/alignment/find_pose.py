@@ -12,34 +12,33 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
 from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean, model_size
 from torchreg.alignment.inputs import (
-    Observation,
+    Task,
     check_clouds,
     check_skin,
-    floating_origin,
     warn_about_degenerate,
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.search.in_picture import surest_crop
-from torchreg.alignment.search.landmark_fit import find_keypoints, measured_alone
-from torchreg.alignment.search.limb_search import distinct_first, take_rows
+from torchreg.alignment.search.landmark_fit import KeypointRows, find_keypoints
+from torchreg.alignment.search.multi_start import Candidates, align_rows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
-from torchreg.alignment.search.pose_search import PoseSearch, mean_distances
+from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.rough_poses import PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.search.start_source import StartSource
-from torchreg.alignment.search.whole_alignment import align_rows, best_distinct, best_first, fit_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
-from torchreg.geometry.far_origin import to_local, to_world
+from torchreg.geometry.far_origin import to_world
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import SkinSurface
 
 
@@ -49,6 +48,7 @@ class _Candidates:
 
     typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
     same: float = 0.05  # found poses whose points differ by less are duplicates
+    alike: float = 0.045  # the same of rough poses
     fit_steps: int = 3  # at each width of the coarse fit
     proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
 
@@ -154,59 +154,51 @@ def find_pose(
     """
     check_count(num_starts, "num_starts", 1)
     config = config or FindPoseConfig()
-    source = StartSource.of(shape, sources, initializer, config.upright)
-    if data is None or isinstance(data, Camera):
-        points = model_points or sample_skin(shape, config.num_model_points)
-        measured = measured_alone(shape, data, keypoints, keypoint_std)
-        return find_keypoints(shape, points, measured, num_starts, KnownDofs.of(shape, locked, prior))
+    source, known = StartSource.of(shape, sources, initializer, config.upright), KnownDofs.of(shape, locked, prior)
+    model = AlignConfig(num_model_points=config.num_model_points)
+    skin = None if model_points is None else check_skin(shape, model_points)
+    task = Task(shape=shape, model_points=skin, known=known, source=source, config=model)
+
+    def found(data: Any, mask: Tensor | None = None) -> PoseStarts:
+        asked = task.observed(data, mask, keypoints, keypoint_std)
+        if asked.seen.points is None:
+            return find_keypoints(KeypointRows.of(task.skin(), asked.seen.keypoints, None, known), num_starts)
+        starts = search_everywhere(asked, num_starts, config).starts
+        return replace(starts, poses=to_world(starts.poses, asked.seen.origin), shape=shape)
+
     if isinstance(data, DepthFrame) and data.mask is None:
-        skin = model_points or sample_skin(shape, config.num_model_points)
-        search = partial(
-            find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
-            locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
-        )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.crop_score, skin))[0]
-    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
-    origin = floating_origin(shape, seen.points)
-    seen, known = to_local(seen, origin), to_local(KnownDofs.of(shape, locked, prior), origin)
-    starts = search_everywhere(shape, seen, num_starts, source, model_points, config, known).starts
-    return replace(starts, poses=to_world(starts.poses, origin), shape=shape)
+        skin = task.skin()
+        task = replace(task, model_points=skin)
+        return surest_crop(data, model_size(skin), found, partial(source.crop_score, skin))[0]
+    return found(data, mask)
 
 
-def search_everywhere(
-    shape: ArticulatedShape,
-    seen: Observation,
-    num_starts: int,
-    source: StartSource,
-    model_points: LinearBlendSkin | None,
-    config: FindPoseConfig,
-    known: KnownDofs | None = None,
-) -> FoundStarts:
+def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> FoundStarts:
     """Return what `find_pose` finds in data near the origin."""
-    seen = seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
+    shape, known = task.shape, task.known
+    seen = task.seen.drawn(shape, config.nan_policy, config.seed, to_search=True)
     with torch.no_grad():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
         origin = masked_mean(batch, batch_valid)
         typical = shifted(bent_pose(shape, _CANDIDATES.typical).expand(len(batch), -1), origin)
-        count = config.num_model_points
-        skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
         problem = centered_problem(
-            skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
+            task.skin(), batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
             free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
             problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
-        warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
-        warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
-        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
+        warn_about_rounding(clouds, "data", problem.size, stacklevel=4)
+        warn_about_units(problem.data, problem.valid, problem.size, stacklevel=4)
+        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=4)
         with one_thread():
-            poses, costs = _find(problem, seen.frames, source.with_known(known), config)
-        lead = _lead(problem, poses, costs)
-        starts = _ranked(problem, poses, costs, lead, num_starts)
-        confidence = torch.where(degenerate, 0.0, starts.confidence)
-        starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)), confidence=confidence)
-    rivals = _rivals(problem, starts, origin)
+            found = _find(problem, seen.frames, task.source.with_known(known), config)
+        lead = found.lead(_CANDIDATES.same)
+        confidence = torch.where(degenerate, 0.0, pose_confidence(problem, found.poses[:, 0], lead))
+        best = found.distinct(_CANDIDATES.same, num_starts)
+        poses = shifted(best.poses, origin.unsqueeze(1))
+        starts = PoseStarts(poses=poses, costs=best.costs, confidence=confidence)
+        rivals = torch.where(_are_rivals(best).unsqueeze(-1), poses, torch.nan)[:, 1:]
     if seen.everything is not None:
         # In data of the whole clouds, each of those drawn stands for several.
         lead = lead * (seen.everything[1].sum(-1) / valid.sum(-1).clamp_min(1)).to(lead)
@@ -227,80 +219,63 @@ class FoundStarts:
 
 def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
-) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs), best first, and costs: a network's, and a search's if in doubt."""
+) -> Candidates:
+    """Return candidates (B, H): a network's, and a search's if in doubt."""
     problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
-    poses, costs = fit_rows(problem, proposed)
-    uncropped = without_cut(problem, poses[:, 0], frames)
-    sure = explains(uncropped, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
+    found = Candidates.fitted(problem, proposed)
+    uncropped = without_cut(problem, found.poses[:, 0], frames)
+    sure = explains(uncropped, found.poses[:, 0], found.lead(_CANDIDATES.same)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
-    first = torch.zeros(len(poses), min(config.num_searched, config.num_placed), dtype=torch.int64, device=poses.device)
-    searched, searched_costs = take_rows(poses, first), costs.gather(1, first)
+    count = min(config.num_searched, config.num_placed)
+    poses, costs = found.poses[:, :1].repeat(1, count, 1), found.costs[:, :1].repeat(1, count)
     if len(rows):
-        found, found_costs = _search_with_retries(problem.rows(rows), source, config, poses[rows])
-        searched[rows], searched_costs[rows] = found, found_costs
-    return best_first(torch.cat([poses, searched], dim=1), torch.cat([costs, searched_costs], dim=1))
+        searched = _search_with_retries(problem.rows(rows), source, config, found.poses[rows])
+        poses[rows], costs[rows] = searched.poses, searched.costs
+    return found.joined(Candidates(problem, poses, costs))
 
 
 def _search_with_retries(
     problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs), best first, and their costs, after as many searches as each cloud needs."""
-    poses, costs = _search(problem, source, config, proposed)
+) -> Candidates:
+    """Return candidates (B, H) after as many searches as each cloud needs."""
+    found = _search(problem, source, config, proposed)
+    poses, costs = found.poses, found.costs
     active = is_misfit(problem, poses[:, 0]).nonzero()[:, 0]
     for number in range(1, config.num_retries + 1):
         if len(active) == 0:
             break
         part = problem.rows(active)
-        retried, retried_costs = _search(part, source, replace(config, seed=config.seed + number), proposed[active])
-        merged, merged_costs = torch.cat([poses[active], retried], 1), torch.cat([costs[active], retried_costs], 1)
-        order = merged_costs.argsort(dim=1, stable=True)[:, : poses.shape[1]]
-        poses[active], costs[active] = take_rows(merged, order), merged_costs.gather(1, order)
+        retried = _search(part, source, replace(config, seed=config.seed + number), proposed[active])
+        merged = Candidates(part, poses[active], costs[active]).joined(retried).take(slice(poses.shape[1]))
+        poses[active], costs[active] = merged.poses, merged.costs
         active = active[is_misfit(part, poses[active, 0])]
-    return poses, costs
+    return Candidates(problem, poses, costs)
 
 
-def _search(
-    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs) after one search, best first, and their costs."""
+def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor) -> Candidates:
+    """Return candidates (B, H) after one search."""
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = source.rough(search.problem, generator)
-    rough, rough_costs = register_rigidly(search.problem, rough, generator)
+    ranked = Candidates.ranked(search.problem, *register_rigidly(search.problem, rough, generator))
     if isinstance(problem.surface, SkinSurface):
-        rough = best_distinct(search.problem, rough, rough_costs, config.num_placed)
-        return fit_rows(
-            problem, align_rows(problem, torch.cat([proposed, rough], dim=1), config.num_searched, generator)
-        )
-    rough = best_distinct(search.problem, rough, rough_costs, config.num_candidates)
+        rough = torch.cat([proposed, ranked.distinct(_CANDIDATES.alike, config.num_placed).poses], dim=1)
+        aligned = align_rows(problem, rough, config.num_searched, _CANDIDATES.alike, generator)
+        return Candidates.fitted(problem, aligned)
+    rough = ranked.distinct(_CANDIDATES.alike, config.num_candidates).poses
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
     pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
-    return fit_rows(problem, poses)
+    return Candidates.fitted(problem, poses)
 
 
-def _lead(problem: AlignProblem, poses: Tensor, costs: Tensor) -> Tensor:
-    """Return the cost (B,) by which the best of different poses is worse than the first, infinite without any."""
-    apart = mean_distances(problem, poses)[:, 0] > _CANDIDATES.same * problem.size
-    return torch.where(apart, costs, torch.inf).amin(1) - costs[:, 0]
-
-
-def _rivals(problem: AlignProblem, starts: PoseStarts, origin: Tensor) -> Tensor:
-    """Return the different starts after the first that explain nearly as much, in the world; see `FoundStarts`."""
-    apart = mean_distances(problem, shifted(starts.poses, -origin.unsqueeze(1))) > _CANDIDATES.same * problem.size
+def _are_rivals(best: Candidates) -> Tensor:
+    """Return which candidates (B, S) after the first differ from all before them and explain nearly as much."""
+    apart = best.apart(_CANDIDATES.same)
     is_later = torch.ones_like(apart[0]).triu()
-    behind = starts.costs - starts.costs[:, :1]
-    is_rival = (apart | is_later).all(-1) & (behind < rival_margin(problem.valid.sum(-1)).unsqueeze(-1))
-    return torch.where(is_rival.unsqueeze(-1), starts.poses, torch.nan)[:, 1:]
-
-
-def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, lead: Tensor, count: int) -> PoseStarts:
-    """Return the candidates, best first; duplicates of a better one come last."""
-    apart = mean_distances(problem, poses) > _CANDIDATES.same * problem.size
-    confidence = pose_confidence(problem, poses[:, 0], lead)
-    order = distinct_first(~apart)[:, :count]
-    return PoseStarts(poses=take_rows(poses, order), costs=costs.gather(1, order), confidence=confidence)
+    behind = best.costs - best.costs[:, :1]
+    margin = rival_margin(best.problem.valid.sum(-1)).unsqueeze(-1)
+    return (apart | is_later).all(-1) & (behind < margin)

@@ -1,11 +1,11 @@
-"""The checks at the public functions of alignment: clouds and masks, skins, units."""
+"""What an alignment is asked for, and its checks at the public functions: clouds and masks, skins, starts, units."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,13 +17,20 @@ from torchreg.alignment.fit.problem import model_size
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
-from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.far_origin import far_origin, to_local, to_world
 from torchreg.geometry.loaded import as_points
 from torchreg.geometry.sampling import draw_spread
 from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
 from torchreg.geometry.units import LENGTHS, likely_unit
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
+
+if TYPE_CHECKING:
+    from torchreg.alignment.config import AlignConfig
+    from torchreg.alignment.fit.annealed_em import OnStep
+    from torchreg.alignment.known_dofs import KnownDofs
+    from torchreg.alignment.search.start_source import StartSource
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,8 @@ _FITTED = _Fitted()
 class Observation:
     """What a shape is aligned to: points ((B,) M, 3), metres, unchecked, or those of depth frames, and keypoints.
 
-    `origin` (3,) is where the points begin; `everything` are checked clouds and valid points of which these are a draw.
+    `origin` (3,) is where the points begin; `everything` are checked clouds and valid points of which these are a draw;
+    keypoints alone have no points, but those in pixels a `camera`.
     """
 
     points: Any
@@ -61,10 +69,13 @@ class Observation:
     keypoints: MeasuredKeypoints | None = None
     origin: Tensor | None = None
     everything: tuple[Tensor, Tensor] | None = None
+    camera: Camera | None = None
 
     @classmethod
     def of(cls, data: Any, mask: Tensor | None) -> Observation:
-        """Return the observation of points, something with points, a depth frame or a sequence of depth frames."""
+        """Return the observation of points, something with points, depth frames, or the camera of keypoints alone."""
+        if data is None or isinstance(data, Camera):
+            return cls(None, None, camera=data)
         several = isinstance(data, Sequence) and any(isinstance(item, DepthFrame) for item in data)
         frames = list(data) if several else [data]
         if not isinstance(frames[0], DepthFrame) and not several:
@@ -120,9 +131,65 @@ class Observation:
             if std is not None:
                 raise InputError("keypoint_std goes with keypoints; give both, or none")
             return self
-        camera = self.frames[0].camera if self.frames else None
+        camera = self.frames[0].camera if self.frames else self.camera
         size = keypoint_extent(shape)
         return replace(self, keypoints=MeasuredKeypoints.of(shape, keypoints, std, camera, size))
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What `align` or `find_pose` is asked for, see there; ``seen`` follows once a picture is cropped."""
+
+    shape: ArticulatedShape
+    source: StartSource
+    config: AlignConfig
+    model_points: Tensor | LinearBlendSkin | None = None
+    known: KnownDofs | None = None
+    start: Tensor | None = None
+    fit_shape: bool = False
+    on_step: OnStep | None = None
+    seen: Observation = Observation(None, None)
+
+    def observed(self, data: Any, mask: Tensor | None, keypoints: Any, keypoint_std: Tensor | float | None) -> Task:
+        """Return the task with what is observed, in coordinates that begin near it, see `floating_origin`."""
+        seen = Observation.of(data, mask).with_keypoints(self.shape, keypoints, keypoint_std)
+        return to_local(replace(self, seen=seen), floating_origin(self.shape, seen.points))
+
+    def near(self, origin: Tensor) -> Task:
+        """Return the same in coordinates that begin at an origin (3,)."""
+        start, points, told = self.start, self.model_points, self.on_step
+        return replace(
+            self,
+            seen=self.seen.near(origin),
+            known=to_local(self.known, origin),
+            start=None if start is None else to_local(torch.as_tensor(start), origin),
+            model_points=to_local(points, origin) if isinstance(points, Tensor) else points,
+            on_step=None if told is None else lambda step: told(replace(step, pose=to_world(step.pose, origin))),
+        )
+
+    def skin(self, pose: Tensor | None = None) -> LinearBlendSkin:
+        """Return the model points as a skin: given, built from points in a pose (1, num_dofs), or sampled."""
+        points, shape, config = self.model_points, self.shape, self.config
+        if isinstance(points, LinearBlendSkin):
+            return check_skin(shape, points)
+        if points is None:
+            return sample_skin(shape, config.num_model_points, sharpness=config.sharpness)
+        if pose is not None and len(pose) != 1:
+            raise InputError("model_points given as a tensor need a single initial_pose; pass a skin for several poses")
+        pose = shape.rest if pose is None else pose[0]
+        return BendingSkin(shape, as_float_tensor(points, "model_points", like=shape.rest), pose, config.sharpness)
+
+    def starts(self, clouds: Tensor, start: Tensor) -> Tensor:
+        """Return checked starts (B, num_dofs) within the limits, one for each cloud or several for a single one."""
+        shape, pose = self.shape, self.shape.check_pose(start, "initial_pose")
+        if not bool(torch.isfinite(pose).all()):
+            raise InputError("initial_pose must be finite")
+        if pose.ndim > 2:
+            raise InputError(f"initial_pose must have one or two dimensions, got shape {tuple(pose.shape)}")
+        if clouds.ndim == 3 and pose.ndim == 2 and len(pose) not in (1, len(clouds)):
+            raise InputError(f"initial_pose must hold one pose per cloud ({len(clouds)}), got {len(pose)}")
+        single = len(pose) if pose.ndim == 2 else 1
+        return shape.clamp(pose.expand(len(clouds) if clouds.ndim == 3 else single, shape.num_dofs))
 
 
 def _padded(clouds: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

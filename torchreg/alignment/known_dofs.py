@@ -15,6 +15,7 @@ from torchreg.alignment.fit.patches import errors_per_patch
 from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem
 from torchreg.errors import InputError, InputTypeError
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, shifted
 
 # Name for all six degrees of freedom of the base.
@@ -59,7 +60,7 @@ class KnownDofs:
         mean = torch.where(self.locked, pose.to(self.mean), self.mean)
         return replace(self, mean=mean, std=torch.where(self.locked, _HELD_STD, self.std))
 
-    def start(self, shape: ArticulatedShape, pose: Tensor | None = None) -> Tensor:
+    def start(self, shape: Articulation, pose: Tensor | None = None) -> Tensor:
         """Return the prior's mean where it has one, elsewhere a given pose or the rest pose."""
         return torch.where(self.std.isfinite(), self.mean, shape.rest if pose is None else pose)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem
 from torchreg.alignment.fit.surface_fit import surface_steps
-from torchreg.alignment.search.pose_search import SEARCH_BUDGET
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.primitives import fuse
 from torchreg.solvers.cover import best_covers

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
-from torchreg.alignment.search.pose_search import PoseSearch, fit_candidates, score_candidates
+from torchreg.alignment.search.multi_start import Candidates, Plan
+from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
@@ -37,7 +38,6 @@ class RecoveryPlan:
     min_gain: float = 4.0  # soft inliers by which another pose must exceed the predicted one: less is chance
     max_doublings: int = 5  # of the cool-down after more failures, to 32 frames
     occluded: float = 0.6  # of the mean inliers missing from the mean number of data: the shape is probably occluded
-    num_steps: int = 2  # at each width of the surface fits from known poses
     num_searched: int = 2  # known poses whose limbs are placed thoroughly
     max_data: int = 3000  # of a search everywhere: more tell no more
     num_proposed: int = 3  # poses of a network that are fitted, different ones
@@ -50,6 +50,8 @@ class RecoveryPlan:
 
 
 _PLAN = RecoveryPlan()
+# Surface fits from known poses.
+_FROM_KNOWN = Plan(widths=WIDTHS.coarse, steps=2, score_width=WIDTHS.stop)
 
 
 class Recovery:
@@ -200,9 +202,8 @@ class Recovery:
         if view is not None:
             known = torch.cat([view.problem.prior.mean[None], view.to_local(state.pose[None])], dim=1)
             known = known if fit is None else torch.cat([fit.pose[None], known], dim=1)
-            fitted = fit_candidates(view.problem, known, WIDTHS.coarse, _PLAN.num_steps)
-            best = score_candidates(view.problem, fitted, WIDTHS.stop)[0].argmin()
-            yield self.fitter.fit(view, state, "surface", fitted[:, best])
+            fitted = Candidates.descended(view.problem, known, _FROM_KNOWN).poses
+            yield self.fitter.fit(view, state, "surface", fitted[:, 0])
         if lost and thorough:
             yield self._propose(state, frame)
         if view is not None and (lost or state.failed_searches >= _PLAN.free_failures):

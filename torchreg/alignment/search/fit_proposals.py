@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.fit.problem import AlignProblem, joint_precision
-from torchreg.alignment.search.limb_search import distinct_first, take_rows
+from torchreg.alignment.search.multi_start import Candidates, Plan
 from torchreg.alignment.search.pose_proposer import Proposals
-from torchreg.alignment.search.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
+from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.solvers.e_step import EStep
 
@@ -26,13 +26,12 @@ class _Fit:
     reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
     joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
     matched_steps: int = 2  # in each round
-    widths: tuple[float, ...] = (0.05, 0.03, 0.02)  # of the kernel, from what a proposal errs by to a searched pose's
-    steps: int = 2  # at each width
-    score_width: float = 0.022  # as in the search
     same: float = 0.05  # fitted poses whose points differ by less are duplicates
 
 
 _FIT = _Fit()
+# From what a proposal errs by to a searched pose's width.
+_PLAN = Plan(widths=(0.05, 0.03, 0.02), steps=2, score_width=0.022)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +49,13 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
     told = with_proposed_prior(problem, proposals)
     coarse = PoseSearch(told, torch.Generator().manual_seed(0)).coarse_problem
     poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
-    fitted, scores = _fitted(coarse, torch.cat([matched_pose(told, proposals).unsqueeze(1), poses], dim=1))
-    apart = mean_distances(coarse, fitted)[:, 0] > _FIT.same * problem.size
+    pool = torch.cat([matched_pose(told, proposals).unsqueeze(1), poses], dim=1)
+    fitted = Candidates.descended(coarse, pool, _PLAN)
     share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
-    lead = torch.where(apart, scores, torch.inf).amin(1) - scores[:, 0]
-    best = fitted[:, 0]
-    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), lead * share)
+    best = fitted.poses[:, 0]
+    return BestProposal(
+        best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead(_FIT.same) * share
+    )
 
 
 @torch.no_grad()
@@ -67,9 +67,8 @@ def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> T
     wide = problem.repeated(number)
     wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
     matched = matched_pose(wide, proposals.repeated(number)).reshape(poses.shape)
-    fitted, _ = _fitted(coarse, torch.cat([poses, matched], dim=1))
-    order = distinct_first(mean_distances(coarse, fitted) < _FIT.same * problem.size)[:, :count]
-    return take_rows(fitted, torch.cat([order, order[:, -1:].expand(-1, count - order.shape[1])], dim=1))
+    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(_FIT.same, count)
+    return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
 
 
 def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
@@ -81,13 +80,6 @@ def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignPro
     told, prior = problem.prior_precision > 0, problem.prior
     mean, precision = torch.where(told, prior.mean, mean), torch.where(told, prior.precision, precision)
     return replace(problem, prior=replace(prior, mean=mean, precision=precision))
-
-
-def _fitted(coarse: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Return poses (B, K, num_dofs) after a coarse fit, best first, and their scores (B, K)."""
-    fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
-    scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
-    return take_rows(fitted, order), scores
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,19 +11,17 @@ from torchreg.alignment.evidence.confidence import end_motions, end_variances, l
 from torchreg.alignment.evidence.curvature import plausible_precision
 from torchreg.alignment.evidence.observability import dof_confidence, told_open
 from torchreg.alignment.evidence.reliability import CALIBRATION
-from torchreg.alignment.fit.landmarks import Landmarks, MeasuredKeypoints, keypoint_extent
+from torchreg.alignment.fit.landmarks import Landmarks, MeasuredKeypoints
 from torchreg.alignment.fit.objectives import Objective
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_problem
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
-from torchreg.alignment.search.limb_search import distinct_first
-from torchreg.alignment.search.pose_search import mean_distances
+from torchreg.alignment.search.multi_start import Candidates
 from torchreg.alignment.search.rough_poses import bent_pose, spread_rotations, typical_poses
 from torchreg.errors import InputError
-from torchreg.geometry.camera import Camera
 from torchreg.geometry.rotation import so3_log
 from torchreg.result import Status, normal_copy
-from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin
 
@@ -49,35 +46,105 @@ _SEARCH = _Search()
 
 
 @dataclass(frozen=True, eq=False)
-class KeypointFit:
-    """Poses (S, num_dofs), best and different ones first, costs (S,), and the lead () over the next different one."""
+class KeypointRows:
+    """Poses (S, num_dofs) of keypoints alone, for `align`: candidates, in the end the different ones, best first.
+
+    ``widths`` are those of the first step; ``costs`` (S,), and the lead () over the next different pose, of the last.
+    """
 
     problem: AlignProblem
     poses: Tensor
+    widths: tuple[float, ...]
     costs: Tensor
     lead: Tensor
 
-    @property
-    def landmarks(self) -> Landmarks:
-        """The measured keypoints."""
-        found = self.problem.factor(Landmarks)
-        if found is None:
-            raise InputError("keypoints are needed where there are no data; give both, or data")
-        return found
+    @classmethod
+    @torch.no_grad()
+    def of(
+        cls, skin: LinearBlendSkin, measured: MeasuredKeypoints | None, start: Tensor | None, known: KnownDofs | None
+    ) -> KeypointRows:
+        """Return the rows of given starts (S, num_dofs), or else of typical poses all around."""
+        if measured is None:
+            raise InputError("data must be given, or keypoints: there is nothing to align to")
+        if measured.targets.ndim != 2:
+            got = tuple(measured.targets.shape)
+            raise InputError(f"keypoints alone must be of one frame, (K, 2) or (K, 3), got {got}")
+        shape = skin.shape
+        origin = _center(shape, measured)[None]
+        near = bent_pose(shape, 0.5) if start is None else start[0]
+        problem = centered_problem(
+            skin, origin.unsqueeze(1), torch.zeros_like(origin[:, :1], dtype=torch.bool), near[None], origin,
+            prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
+        )  # fmt: skip
+        if known is not None:
+            given = known.start(shape, None if start is None else near)
+            problem = known.with_prior(problem, shifted(given[None], -origin))
+        pool = _all_around(problem) if start is None else shifted(start, -origin)
+        pool = problem.clamp_candidates(pool[None])[0]
+        widths = _SEARCH.widths if start is None else _SEARCH.near_widths
+        return cls(problem, pool, widths, costs=pool[:, 0], lead=pool[0, 0])
+
+    def annealed(self) -> KeypointRows:
+        """Return the best rows after damped steps at narrowing widths."""
+        pool = _descended(self.problem, self.poses, self.widths)
+        best = _objective(self.problem.repeated(len(pool)), 0.0).cost(pool).argsort()[: _SEARCH.refined]
+        return replace(self, poses=pool[best])
+
+    def fitted(self) -> KeypointRows:
+        """Return the rows fitted down to the keypoints' own errors alone."""
+        pool = _descended(self.problem, self.poses, _SEARCH.fine_widths)
+        wide = self.problem.repeated(len(pool))
+        objective = _objective(wide, 0.0)
+        poses = wide.solve(objective, pool, _SEARCH.refine_steps, objective(pool)).state
+        # The weak prior ranks as it does beside data.
+        return replace(self, poses=poses, costs=wide.factor_score(poses, 0.0) + PRIOR_SHARE * wide.prior.cost(poses))
+
+    def restarted(self) -> KeypointRows:
+        """Return the rows, which began all around."""
+        return self
+
+    def finished(self) -> KeypointRows:
+        """Return the rows, best first, duplicates of better ones last."""
+        ranked = Candidates.ranked(self.problem, self.poses[None], self.costs[None])
+        first = ranked.distinct(_SEARCH.same)
+        return replace(self, poses=first.poses[0], costs=first.costs[0], lead=ranked.lead(_SEARCH.same)[0])
+
+    def judged(self) -> AlignResult:
+        """Return the alignment of the first row; it has no data."""
+        skin, size, landmarks, covariance = self.problem.skin, self.problem.size, self._landmarks, self._covariance()
+        confidence = self._confidence(covariance)
+        pose, none = shifted(self.poses[0], self.problem.origin[0]), skin.points.new_zeros(0)
+        sure, right = float(confidence) >= CALIBRATION.doubtful, int(landmarks.agree(self.poses[:1])[0].sum())
+        wrong = int(landmarks.seen.sum()) - right
+        reasons = [f"{wrong} of the seen keypoints do not agree with the pose"] * (wrong > 0)
+        reasons += ["keypoints alone do not tell where the limbs end"] * (not sure)
+        reasons += filter(None, [told_open(skin.shape, covariance[0], size)])
+        status = Status.CONVERGED if sure else Status.DOUBTFUL
+        return normal_copy(AlignResult(
+            pose=pose, registered=skin(pose), keypoints=skin.shape.keypoints(pose), distances=none,
+            inliers=none.bool(), posterior=none, sigma=none.sum(), cost=self.costs[0],
+            status=Status.FEW_INLIERS if right < _SEARCH.least else status,
+            covariance=covariance[0], confidence=confidence,
+            doubt="; ".join(reasons), dof_confidence=dof_confidence(skin.shape, covariance[0], size),
+        ))  # fmt: skip
+
+    def found(self, count: int) -> PoseStarts:
+        """Return the first rows as starts."""
+        poses = shifted(self.poses[:count], self.problem.origin)
+        return PoseStarts(poses=poses, costs=self.costs[:count], confidence=self._confidence(self._covariance()))
 
     @property
-    def right(self) -> Tensor:
-        """Mask (K,) of the keypoints that agree with the first pose."""
-        return self.landmarks.agree(self.poses[:1])[0]
+    def _landmarks(self) -> Landmarks:
+        return next(factor for factor in self.problem.factors if isinstance(factor, Landmarks))
 
-    def covariance(self) -> Tensor:
+    def _covariance(self) -> Tensor:
         """Return the covariance (1, num_dofs, num_dofs) of the first pose, in tangent coordinates."""
         pose = self.poses[:1]
         precision = plausible_precision(self.problem, pose).double()
-        information = self.landmarks.linearized(pose, 0.0).hessian.double() + torch.diag_embed(precision)
+        information = self._landmarks.linearized(pose, 0.0).hessian.double() + torch.diag_embed(precision)
         return torch.linalg.inv(information).to(pose)
 
-    def confidence(self, covariance: Tensor) -> Tensor:
+    def _confidence(self, covariance: Tensor) -> Tensor:
         """Return the probability () that the limbs end where the first pose has them, by a Rayleigh distribution."""
         skin = self.problem.skin
         moves = end_motions(skin, self.poses[:1], limb_ends(skin))
@@ -86,37 +153,7 @@ class KeypointFit:
         return known * torch.sigmoid(self.lead.clamp_max(1 / torch.finfo(variance.dtype).eps))
 
 
-def fit_keypoints(
-    shape: ArticulatedShape,
-    skin: LinearBlendSkin,
-    measured: MeasuredKeypoints,
-    start: Tensor | None,
-    known: KnownDofs | None,
-) -> KeypointFit:
-    """Return the poses that explain the keypoints of a frame, from starts ((S,) num_dofs) or a global search."""
-    if measured.targets.ndim != 2:
-        raise InputError(f"keypoints alone must be of one frame, (K, 2) or (K, 3), got {tuple(measured.targets.shape)}")
-    origin = _center(shape, measured)[None]
-    near = bent_pose(shape, 0.5) if start is None else start.reshape(-1, shape.num_dofs)[0]
-    problem = centered_problem(
-        skin, origin.unsqueeze(1), torch.zeros_like(origin[:, :1], dtype=torch.bool), near[None], origin,
-        prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
-    )  # fmt: skip
-    if known is not None:
-        given = known.start(shape, start if start is None else near)
-        problem = known.with_prior(problem, shifted(given[None], -origin))
-    if start is None:
-        pool, widths = _all_around(problem), _SEARCH.widths
-    else:
-        pool, widths = shifted(start.reshape(-1, shape.num_dofs), -origin), _SEARCH.near_widths
-    pool = problem.clamp_candidates(pool[None])[0]
-    for width in widths:
-        pool = _descended(problem, pool, width * problem.size)
-    best = _objective(problem.repeated(len(pool)), 0.0).cost(pool).argsort()[: _SEARCH.refined]
-    return _refined(problem, pool[best])
-
-
-def _center(shape: ArticulatedShape, measured: MeasuredKeypoints) -> Tensor:
+def _center(shape: Articulation, measured: MeasuredKeypoints) -> Tensor:
     """Return about where the measured keypoints are (3,); in a picture, by how large they look."""
     targets = measured.targets[measured.targets.isfinite().all(-1)].double()
     middle = targets.median(0).values
@@ -144,79 +181,17 @@ def _objective(wide: AlignProblem, width: float) -> Objective:
     return Objective(None, wide.factors, wide.prior, sigma, sigma)
 
 
-def _descended(problem: AlignProblem, pool: Tensor, width: float) -> Tensor:
-    """Return candidates (S, num_dofs) after damped steps at one width, metres."""
+def _descended(problem: AlignProblem, pool: Tensor, widths: tuple[float, ...]) -> Tensor:
+    """Return candidates (S, num_dofs) after damped steps at some widths, shares of the size."""
     wide = problem.repeated(len(pool))
-    objective = _objective(wide, width)
-    for _ in range(_SEARCH.steps):
-        pool = wide.step(objective(pool), pool).state
+    for width in widths:
+        objective = _objective(wide, width * problem.size)
+        for _ in range(_SEARCH.steps):
+            pool = wide.step(objective(pool), pool).state
     return pool
 
 
-def _refined(problem: AlignProblem, pool: Tensor) -> KeypointFit:
-    """Return candidates (S, num_dofs) refined down to the keypoints' own errors alone, best first."""
-    for width in _SEARCH.fine_widths:
-        pool = _descended(problem, pool, width * problem.size)
-    wide = problem.repeated(len(pool))
-    objective = _objective(wide, 0.0)
-    poses = wide.solve(objective, pool, _SEARCH.refine_steps, objective(pool)).state
-    # The weak prior ranks as it does beside data.
-    costs = wide.factor_score(poses, 0.0) + PRIOR_SHARE * wide.prior.cost(poses)
-    order = costs.argsort()
-    poses, costs = poses[order], costs[order]
-    apart = mean_distances(problem, poses[None])[0] > _SEARCH.same * problem.size
-    lead = torch.where(apart[0], costs, torch.inf).amin() - costs[0]
-    first = distinct_first(~apart[None])[0]
-    return KeypointFit(problem, poses[first], costs[first], lead)
-
-
-def align_keypoints(
-    shape: ArticulatedShape,
-    skin: LinearBlendSkin,
-    measured: MeasuredKeypoints,
-    start: Tensor | None,
-    known: KnownDofs | None,
-) -> AlignResult:
-    """Return the alignment to keypoints alone, see `fit_keypoints`; it has no data."""
-    with torch.no_grad():
-        fit = fit_keypoints(shape, skin, measured, start, known)
-        covariance = fit.covariance()
-        confidence = fit.confidence(covariance)
-        pose, none = shifted(fit.poses[0], fit.problem.origin[0]), skin.points.new_zeros(0)
-        sure, right = float(confidence) >= CALIBRATION.doubtful, int(fit.right.sum())
-        wrong = int(fit.landmarks.seen.sum()) - right
-        reasons = [f"{wrong} of the seen keypoints do not agree with the pose"] * (wrong > 0)
-        reasons += ["keypoints alone do not tell where the limbs end"] * (not sure)
-        reasons += filter(None, [told_open(shape, covariance[0], fit.problem.size)])
-        status = Status.CONVERGED if sure else Status.DOUBTFUL
-        found = AlignResult(
-            pose=pose, registered=skin(pose), keypoints=skin.shape.keypoints(pose), distances=none,
-            inliers=none.bool(), posterior=none, sigma=none.sum(), cost=fit.costs[0],
-            status=Status.FEW_INLIERS if right < _SEARCH.least else status,
-            covariance=covariance[0], confidence=confidence,
-            doubt="; ".join(reasons), dof_confidence=dof_confidence(shape, covariance[0], fit.problem.size),
-        )  # fmt: skip
-        return normal_copy(found)
-
-
-def find_keypoints(
-    shape: ArticulatedShape,
-    skin: LinearBlendSkin,
-    measured: MeasuredKeypoints,
-    num_starts: int,
-    known: KnownDofs | None,
-) -> PoseStarts:
-    """Return the poses that keypoints alone allow, see `fit_keypoints`."""
-    with torch.no_grad():
-        fit = fit_keypoints(shape, skin, measured, None, known)
-        poses = shifted(fit.poses[:num_starts], fit.problem.origin)
-        return PoseStarts(poses=poses, costs=fit.costs[:num_starts], confidence=fit.confidence(fit.covariance()))
-
-
-def measured_alone(
-    shape: ArticulatedShape, camera: Camera | None, keypoints: Any, keypoint_std: Any
-) -> MeasuredKeypoints:
-    """Return keypoints that are the only measurement, checked."""
-    if keypoints is None:
-        raise InputError("data must be given, or keypoints: there is nothing to align to")
-    return MeasuredKeypoints.of(shape, keypoints, keypoint_std, camera, keypoint_extent(shape))
+@torch.no_grad()
+def find_keypoints(rows: KeypointRows, count: int) -> PoseStarts:
+    """Return the first poses that keypoints alone allow."""
+    return rows.annealed().fitted().finished().found(count)

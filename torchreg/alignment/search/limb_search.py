@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.fit.problem import BALL_AXES, PRIOR_SHARE, AlignProblem
+from torchreg.alignment.search.multi_start import distinct_first, rows_in_memory, take_rows
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.articulation import Articulation
@@ -57,8 +58,6 @@ class _Placement:
     same: float = 0.25  # configurations of a limb whose joints all differ by less are duplicates, radians
     noise: float = 0.006  # standard deviation of the data for the weight of the prior, as a share of the model's size
     max_step: float = 0.3  # of a joint, radians or metres
-    cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
-    device_entries: int = 150_000_000  # of a table in memory on other devices: enough to keep them busy
 
 
 _SAMPLING = _Sampling()
@@ -75,17 +74,6 @@ class _Beam:
 
     def take(self, index: Tensor) -> _Beam:
         return _Beam(take_rows(self.poses, index), take_rows(self.losses, index), take_rows(self.frames, index))
-
-
-def rows_in_memory(count: int, entries: int, device: torch.device) -> tuple[Tensor, ...]:
-    """Return the indices of ``count`` problems in groups whose tables, of so many entries each, fit into memory."""
-    most = _PLACEMENT.cpu_entries if device.type == "cpu" else _PLACEMENT.device_entries
-    return torch.arange(count, device=device).split(max(1, most // max(1, entries)))
-
-
-def take_rows(table: Tensor, index: Tensor) -> Tensor:
-    """Return rows ``index`` (B, C) of a table (B, K, ...)."""
-    return table.gather(1, index.reshape(*index.shape, *[1] * (table.ndim - 2)).expand(*index.shape, *table.shape[2:]))
 
 
 def joint_samples(shape: Articulation, body: Body) -> Tensor:
@@ -334,11 +322,3 @@ def _diverse(joints: Tensor, cost: Tensor, count: int) -> Tensor:
     joints = take_rows(joints, order)
     close = (joints.unsqueeze(2) - joints.unsqueeze(1)).abs().amax(-1) < _PLACEMENT.same
     return order.gather(1, distinct_first(close)[:, :count])
-
-
-def distinct_first(close: Tensor) -> Tensor:
-    """Return the order (B, K) that moves items to the end that are close (B, K, K) to an item kept before them."""
-    kept = torch.ones_like(close[..., 0])
-    for rank in range(1, close.shape[-1]):
-        kept[:, rank] = ~(close[:, rank, :rank] & kept[:, :rank]).any(-1)
-    return kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)

@@ -13,8 +13,8 @@ from torchreg.alignment.evidence.clusters import clustered_data, leaves_clusters
 from torchreg.alignment.evidence.confidence import explains
 from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.search.multi_start import Candidates, align_rows
 from torchreg.alignment.search.pose_search import PoseSearch
-from torchreg.alignment.search.whole_alignment import align_rows, fit_rows
 from torchreg.shapes.limbs import Limb, find_limbs
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 from torchreg.shapes.surface import SkinSurface
@@ -49,6 +49,7 @@ class _Around:
 
     fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
+    same: float = 0.045  # share of the size: rigs whose points differ by less are duplicates
     num_refined: int = 3  # candidates that are refined thoroughly, at most
     data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
     entries: int = 4_000_000  # of a table in memory
@@ -135,7 +136,8 @@ def _aligned_around(
     """Return the best poses of rigs whose candidates around the starts and the descents are aligned whole."""
     limbs, count = find_limbs(problem.skin.shape)[0], max(1, candidates // 4)
     pool = [_scatter(problem, limbs, center, count, generator) for center in (start, descended)]
-    return fit_rows(problem, align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, generator))[0][:, 0]
+    aligned = align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, _AROUND.same, generator)
+    return Candidates.fitted(problem, aligned).poses[:, 0]
 
 
 def _search_around(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,36 +9,27 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem
-from torchreg.alignment.fit.surface_fit import surface_steps
-from torchreg.alignment.search.limb_search import Effort, LimbSearch, distinct_first, take_rows
+from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.search.limb_search import Effort, LimbSearch
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, descend, take_rows
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface
-from torchreg.solvers.robust import welsch_loss
 
 
 @dataclass(frozen=True)
 class _Stage:
-    """Settings of a stage: placing limbs, fitting to the surface, scoring. Widths are shares of the model's size."""
+    """Settings of a stage: placing limbs, then fits to the surface and scores."""
 
     effort: Effort
-    fit_widths: tuple[float, ...]
-    fit_steps: int
-    score_width: float
+    plan: Plan
 
 
 @dataclass(frozen=True)
-class _Budget:
-    """Numbers of all stages; lengths are shares of the model's size."""
+class _Search:
+    """Numbers of the search; lengths are shares of the model's size."""
 
-    coarse_widths: tuple[float, ...] = (0.12, 0.08, 0.05, 0.03, 0.018)  # of the kernel in the coarse fits
-    num_data: int = 800  # of the refinement: more tell candidates apart no better
-    num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
-    num_model_points: int = 120  # that cover the shape
-    num_compared: int = 60  # model points by which candidates are compared
     same: float = 0.005  # candidates whose points differ by less are duplicates
-    noise: float = 0.01  # standard deviation of the data for the weight of the prior
     min_gain: float = 0.5  # in data explained: a round that gains less is the last
 
 
@@ -49,20 +38,17 @@ _PRUNE = _Stage(
         num_data=150, width=0.05, beam=82, configurations=41, refine_widths=(), score_width=0.05, combinations=2,
         exchanged=0,
     ),
-    fit_widths=(0.04, 0.03, 0.025),
-    fit_steps=1,
-    score_width=0.022,
+    plan=Plan(widths=(0.04, 0.03, 0.025), steps=1, score_width=0.022),
 )  # fmt: skip
 _REFINE = _Stage(
     effort=Effort(
         num_data=250, width=0.05, beam=123, configurations=40, refine_widths=(0.04, 0.03, 0.025), score_width=0.02,
         combinations=8, exchanged=3,
     ),
-    fit_widths=(0.03, 0.022, 0.018),
-    fit_steps=2,
-    score_width=0.018,
+    plan=Plan(widths=(0.03, 0.022, 0.018), steps=2, score_width=0.018),
 )  # fmt: skip
-SEARCH_BUDGET = _Budget()
+_COARSE = Plan(widths=(0.12, 0.08, 0.05, 0.03, 0.018), steps=3, score_width=0.022)
+_SEARCH = _Search()
 
 
 class PoseSearch:
@@ -88,80 +74,47 @@ class PoseSearch:
 
     def fitted_score(self, poses: Tensor) -> Tensor:
         """Return the scores (B,) of poses (B, num_dofs) after a fit without any search, comparable to `refine`'s."""
-        fitted = fit_candidates(self.problem, poses.unsqueeze(1), _REFINE.fit_widths, _REFINE.fit_steps)
-        return score_candidates(self.problem, fitted, _REFINE.score_width)[:, 0]
+        return descend(self.problem, poses.unsqueeze(1), _REFINE.plan)[1][:, 0]
 
     def fit_coarsely(self, pool: Tensor, steps: int) -> Tensor:
         """Return candidates (B, N, num_dofs) after surface fits of narrowing kernels, best and different ones first."""
-        fitted = fit_candidates(self.coarse_problem, pool, SEARCH_BUDGET.coarse_widths, steps)
-        return self._best_first(fitted, score_candidates(self.coarse_problem, fitted, _PRUNE.score_width))
+        fitted = Candidates.descended(self.coarse_problem, pool, replace(_COARSE, steps=steps))
+        return fitted.distinct(_SEARCH.same).poses
 
     def prune(self, pool: Tensor, count: int) -> Tensor:
         """Return the best, different ``count`` of candidates (B, N, num_dofs), limbs placed anew or as given."""
-        return self._best_first(*self._best_options(self.coarse_problem, pool, _PRUNE, 0))[:, :count]
+        return self._best_options(self.coarse_problem, pool, _PRUNE, 0).distinct(_SEARCH.same, count).poses
 
     def refine(self, candidates: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
         """Return candidates (B, H, num_dofs) after a thorough search, best first, and their scores (B, H)."""
-        poses, scores = self._best_options(self.problem, candidates, _REFINE, 1)
-        order = scores.argsort(1)
-        poses, scores = take_rows(poses, order), scores.gather(1, order)
+        first = self._best_options(self.problem, candidates, _REFINE, 1)
+        poses, scores = first.poses, first.costs
         active = torch.arange(len(poses), device=poses.device)
         for number in range(2, rounds + 1):
             part = self.problem.rows(active)
-            best, score = self._best_options(part, poses[active, :1], _REFINE, number)
-            gain = scores[active, 0] - score[:, 0]
+            best = self._best_options(part, poses[active, :1], _REFINE, number)
+            gain = scores[active, 0] - best.costs[:, 0]
             better = (gain > 0).unsqueeze(-1)
-            poses[active, 0] = torch.where(better, best[:, 0], poses[active, 0])
-            scores[active, 0] = torch.minimum(score[:, 0], scores[active, 0])
-            active = active[gain > SEARCH_BUDGET.min_gain]
+            poses[active, 0] = torch.where(better, best.poses[:, 0], poses[active, 0])
+            scores[active, 0] = torch.minimum(best.costs[:, 0], scores[active, 0])
+            active = active[gain > _SEARCH.min_gain]
             if len(active) == 0:
                 break
         return poses, scores
 
-    def _best_first(self, poses: Tensor, scores: Tensor) -> Tensor:
-        poses = take_rows(poses, scores.argsort(1))
-        same = mean_distances(self.problem, poses) < SEARCH_BUDGET.same * self.problem.size
-        return take_rows(poses, distinct_first(same))
-
-    def _best_options(
-        self, problem: AlignProblem, candidates: Tensor, stage: _Stage, number: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return candidates (B, N, num_dofs) fitted with their limbs placed anew or as given, and scores (B, N)."""
+    def _best_options(self, problem: AlignProblem, candidates: Tensor, stage: _Stage, number: int) -> Candidates:
+        """Return candidates (B, N, num_dofs) fitted with their limbs placed anew or as given, whichever is better."""
         generator = torch.Generator().manual_seed(self.seed + number)
         wide = problem.repeated(candidates.shape[1])
         placed = self.limbs(wide, candidates.flatten(0, 1), stage.effort, generator).unflatten(0, candidates.shape[:2])
         options = torch.cat([placed, candidates.unsqueeze(2)], dim=2)
-        fitted = fit_candidates(problem, options.flatten(1, 2), stage.fit_widths, stage.fit_steps)
-        scores = score_candidates(problem, fitted, stage.score_width).unflatten(1, options.shape[1:3])
-        best, choice = scores.min(-1)
+        fitted, scores = descend(problem, options.flatten(1, 2), stage.plan)
+        best, choice = scores.unflatten(1, options.shape[1:3]).min(-1)
         first = torch.arange(choice.shape[1], device=choice.device) * options.shape[2]
-        return take_rows(fitted, first + choice), best
+        return Candidates.ranked(problem, take_rows(fitted, first + choice), best)
 
 
 def _coarse_skin(skin: LinearBlendSkin) -> LinearBlendSkin:
     """Return a skin of few points that cover the given one's."""
     index = farthest_points(skin.points, min(SEARCH_BUDGET.num_model_points, len(skin)))
     return LinearBlendSkin(skin.shape, skin.points[index], skin.weights[index], skin.reference_pose)
-
-
-def mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
-    """Return the distances (B, K, K) of model points, as root mean squares, between poses (B, K, num_dofs)."""
-    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_compared), :]
-    return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
-
-
-def fit_candidates(problem: AlignProblem, poses: Tensor, widths: Sequence[float], steps: int) -> Tensor:
-    """Return poses (B, K, num_dofs) after damped steps on the surface, ``steps`` at each width (shares of the size)."""
-    wide, pose = problem.repeated(poses.shape[1]), poses.flatten(0, 1)
-    noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
-    for width in widths:
-        pose = surface_steps(wide, pose, torch.full_like(noise, width * problem.size), noise, steps).state
-    return pose.reshape(poses.shape)
-
-
-def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
-    """Return the score (B, K) of poses (B, K, num_dofs), as `alignment_cost`; lower is better."""
-    distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
-    outliers = welsch_loss((distance / (width * problem.size)).square())
-    scores = (outliers * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
-    return scores + problem.factor_score(poses, width)

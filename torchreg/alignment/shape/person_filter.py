@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
@@ -18,6 +19,7 @@ from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.shaped import ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
+from torchreg.solvers.arrow import shared_information
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,8 @@ class PersonFilter:
             coefficients = moved[:, dofs:].clamp(self.space.lower, self.space.upper)
             state = torch.cat([moved[:, :dofs], coefficients], dim=-1)
         hessian, _ = self._normal_equations(surface, data, valid, state)
-        by_pose, across = hessian[:dofs, :dofs] + self._precision.diag(), hessian[:dofs, dofs:]
-        gained = hessian[dofs:, dofs:] - across.mT @ torch.linalg.solve(by_pose, across)
-        covariance = torch.linalg.inv(information + 0.5 * (gained + gained.mT))
+        alone = hessian + pad(self._precision, (0, len(information))).diag()
+        covariance = torch.linalg.inv(information + shared_information(alone, dofs))
         return KnownPerson(state[0, dofs:], covariance.to(person.covariance))
 
     def differs(self, first: Tensor, second: Tensor) -> bool:

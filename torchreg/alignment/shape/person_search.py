@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchreg.alignment.evidence.clusters import CLUSTERS
 from torchreg.alignment.fit.problem import AlignProblem
-from torchreg.alignment.search.limb_search import distinct_first, joint_samples, take_rows
-from torchreg.alignment.search.pose_search import mean_distances
+from torchreg.alignment.search.limb_search import joint_samples
+from torchreg.alignment.search.multi_start import Candidates
 from torchreg.alignment.search.rough_poses import (
     UprightRotations,
     closeness,
@@ -35,7 +35,6 @@ class _PersonSearch:
     """Numbers of the search."""
 
     num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
-    num_compared: int = 400  # best candidates, among which different ones are sought
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
     duplicate_limb_rms: float = 0.03  # the same, of states that differ in one limb only
     other: float = 0.05  # the same, of fitted people: what differs by more is a rival
@@ -74,9 +73,7 @@ def find_people(
     states[..., :3] += median - torch.stack([problem.skin(rows).mean(-2) for rows in states])
     states = problem.clamp_candidates(states.flatten(0, -2).unsqueeze(0))
     registered, costs = register_rigidly(problem, states, generator)
-    best = take_rows(registered, costs.argsort(1)[:, : _SEARCH.num_compared])
-    order = distinct_first(mean_distances(problem, best) < _SEARCH.same * problem.size)
-    return take_rows(best, order[:, :count])[0]
+    return Candidates.ranked(problem, registered, costs).distinct(_SEARCH.same, count).poses[0]
 
 
 def limb_restarts(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -106,11 +103,10 @@ def limb_restarts(problem: ShapeProblem, state: Tensor, count: int, generator: t
         costs.append(two_sided_cost(torch.maximum(data, rest_data), near, drawn))
     if not swung:
         return state[None][:0]
-    best = take_rows(torch.cat(swung, dim=1), torch.cat(costs, dim=1).argsort(1)[:, : _SEARCH.num_compared])
-    # Those who hardly differ from the given one are duplicates of it.
-    best = torch.cat([state[None, None], best], dim=1)
-    order = distinct_first(mean_distances(problem, best) < _SEARCH.duplicate_limb_rms * size)
-    return take_rows(best, order[:, 1 : 1 + count])[0]
+    # Those who hardly differ from the given one, the first, are duplicates of it.
+    pool = torch.cat([state[None, None], *swung], dim=1)
+    ranked = Candidates.ranked(problem, pool, torch.cat([torch.full((1, 1), -torch.inf).to(state), *costs], dim=1))
+    return ranked.distinct(_SEARCH.duplicate_limb_rms, 1 + count).poses[0, 1:]
 
 
 def _with_joints(state: Tensor, bodies: Sequence[Body], values: Tensor) -> Tensor:
@@ -133,6 +129,4 @@ def rotation_restarts(problem: ShapeProblem, state: Tensor) -> Tensor:
 
 def lead_over_rivals(problem: AlignProblem, states: Tensor, costs: Tensor) -> Tensor:
     """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity."""
-    best = int(costs.argmin())
-    apart = mean_distances(problem, states.unsqueeze(0))[0, best] > _SEARCH.other * problem.size
-    return torch.where(apart, costs, math.inf).amin().unsqueeze(0) - costs[best]
+    return Candidates.ranked(problem, states[None], costs[None]).lead(_SEARCH.other)

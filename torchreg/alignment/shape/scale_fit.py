@@ -13,6 +13,7 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.scale_jacobian import SCALE_RANGE, scale_jacobian
+from torchreg.solvers.arrow import join_shared
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
@@ -65,7 +66,7 @@ class ScalePrior:
         return cls(poses=poses, pose_precision=pose_precision, scales=scales, scale_precision=precision)
 
     def add_to(self, problem: Linearization, poses: Tensor, scales: Tensor) -> Linearization:
-        """Return the problem of one state with the prior added."""
+        """Return the problem of one state, as a batch of one, with the prior added."""
         joints = (poses - self.poses).flatten()
         precision = self.pose_precision.expand_as(poses).flatten()
         offset = scales - self.scales
@@ -141,16 +142,9 @@ class ScaleProblem:
         distance, by_pose = self.shape.distance_jacobian(self.data, poses, chart="tangent")
         jacobian = torch.cat([by_pose, scale_jacobian(self.shape, self.data, poses)], dim=-1)
         beta = welsch_weight((distance / sigma).square())
-        cost = 0.5 * (sigma / noise) ** 2 * ((1 - beta) * self.valid).sum()
+        cost = 0.5 * (sigma / noise) ** 2 * ((1 - beta) * self.valid).sum(-1)
         weighted = jacobian * (beta * self.valid / noise**2).unsqueeze(-1)
-        gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
-        hessian = weighted.mT @ jacobian
+        rows = Linearization(cost, (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1), weighted.mT @ jacobian)
         # Poses of different frames meet in the scales only.
-        dofs = poses.shape[-1]
-        gradients = torch.cat([gradient[:, :dofs].flatten(), gradient[:, dofs:].sum(0)])
-        across = hessian[:, :dofs, dofs:].flatten(0, 1)
-        blocks = torch.block_diag(*hessian[:, :dofs, :dofs])
-        corner = hessian[:, dofs:, dofs:].sum(0)
-        full = torch.cat([torch.cat([blocks, across], dim=1), torch.cat([across.mT, corner], dim=1)])
-        problem = self.prior.add_to(Linearization(cost, gradients, full), poses, scales)
-        return Linearization(problem.cost.view(1), problem.gradient.unsqueeze(0), problem.hessian.unsqueeze(0))
+        joined = join_shared(Linearization(*(value.unsqueeze(0) for value in rows)), poses.shape[-1])
+        return self.prior.add_to(joined, poses, scales)

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchreg.alignment.evidence.clusters import leaves_clusters
-from torchreg.alignment.evidence.confidence import EVIDENCE, end_variances
+from torchreg.alignment.evidence.confidence import end_variances
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.evidence.reliability import SurfaceError
-from torchreg.alignment.fit.annealed_em import ANNEALING, OnStep, StageResult, anneal
+from torchreg.alignment.fit.annealed_em import StageResult
 from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import BROAD_PRIOR, joint_precision, masked_mean, model_size
-from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
-from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
-from torchreg.alignment.results import AlignRecord
-from torchreg.alignment.shape.person_search import find_people, lead_over_rivals, limb_restarts, rotation_restarts
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, pose_covariance, surface_noise
+from torchreg.alignment.shape.person_search import find_people
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
@@ -28,7 +24,6 @@ from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.upright import Direction
-from torchreg.result import normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shape_space import ShapeSpace
@@ -98,145 +93,16 @@ def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = 
     return shape
 
 
-@torch.inference_mode()
-def fit_coefficients(
-    shape: ArticulatedShape,
-    data: Tensor,
-    valid: Tensor,
-    poses: Tensor | None,
-    *,
-    config: AlignConfig,
-    viewpoints: Tensor | None = None,
-    on_step: OnStep | None = None,
-) -> FittedShape:
-    """Return the poses of T scans (T, M, 3) of one shape and the coefficients that they share.
-
-    Annealed EM, with normals, registers shapes of different sizes; the best are fitted to the surface, coefficients as
-    further columns of the normal equations. Poses (T, num_dofs) are at the mean coefficients; None searches one scan's.
-    """
-    generator = torch.Generator().manual_seed(config.seed)
-    problem, start = _problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
-    if on_step is not None:
-        on_step = partial(_tell, on_step, problem, shape.num_dofs)
-    coarse = problem.sample(SHAPE_FIT.coarse_data, generator)
-    widths = config.schedule or ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)
-    found = anneal(coarse, start, widths, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step)
-    sigma = found.sigma[:1]
-    num_kept = SHAPE_FIT.num_kept if poses is not None else SHAPE_FIT.num_found_kept
-    kept = problem.people(coarse.cost_of_people(found.pose).argsort()[:num_kept])
-    coarse, state = coarse.rows(kept), found.pose[kept]
-    state = fit_surface(coarse, state, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
-    descend = _Descent(config, on_step)
-    state = _placed_again(coarse, state, descend)
-    if problem.scans == 1:
-        state = _explained_anew(coarse, state, descend, generator, searched=poses is None)
-    costs = coarse.cost_of_people(state)
-    lead = lead_over_rivals(coarse, state, costs) if poses is None else None
-    best = problem.people(costs.argmin().unsqueeze(0))
-    problem, state = problem.rows(kept[best]), state[best]
-    fine = problem.sample(SHAPE_FIT.fine_data, generator)
-    state = fit_surface(fine, state, steps=SHAPE_FIT.fine_steps, on_step=on_step).pose
-    alike = shape.coefficient_space().alike
-    if alike is not None:
-        fine, state = _with_learned_spread(fine, state, alike, on_step)
-        problem = replace(problem, prior=replace(problem.prior, precision=fine.prior.precision))
-    finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
-    before = finish(state, steps=SHAPE_FIT.fine_steps).pose
-    last = replace(finish(before, steps=1), sigma=sigma)
-    return replace(_fitted(problem, before, last, shape.num_dofs), lead=lead)
-
-
-def _placed_again(problem: ShapeProblem, state: Tensor, descend: _Descent) -> Tensor:
-    """Return states (B, D + K) after another, narrower annealing, where that explains more of the data."""
-    found = descend(problem, state, _narrow(problem))
-    better = problem.cost_of_people(found) < problem.cost_of_people(state)
-    return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
-
-
-def _explained_anew(
-    problem: ShapeProblem, state: Tensor, descend: _Descent, generator: torch.Generator, *, searched: bool
-) -> Tensor:
-    """Return states (B, D + K) in one scan, the best with one limb re-initialized where clusters are left over."""
-    costs = problem.cost_of_people(state)
-    best = costs.argmin().unsqueeze(0)
-    one = problem.rows(best)
-    if not bool(leaves_clusters(one, state[best])):
-        return state
-    others = [(limb_restarts(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
-    if searched:
-        others.append((rotation_restarts(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
-    # A chain without branches has no limb to swing.
-    others = [(start, widths) for start, widths in others if len(start)]
-    if not others:
-        return state
-    found = torch.cat([descend(problem.rows(best.expand(len(start))), start, widths) for start, widths in others])
-    again, choice = problem.rows(best.expand(len(found))).cost_of_people(found).min(0)
-    # A smaller lead is no evidence.
-    better = float(again) < float(costs[best]) - EVIDENCE.lead
-    return state.index_copy(0, best, found[choice].unsqueeze(0)) if better else state
-
-
-def _narrow(problem: ShapeProblem) -> SigmaSchedule:
-    """Return the schedule of people whose size and trunk are right."""
-    return SigmaSchedule.geometric(SHAPE_FIT.again * problem.size, ANNEALING.stop * problem.size, SHAPE_FIT.em_steps)
-
-
-@dataclass(frozen=True)
-class _Descent:
-    """Annealed EM, then a coarse fit to the surface."""
-
-    config: AlignConfig
-    on_step: OnStep | None
-
-    def __call__(self, problem: ShapeProblem, state: Tensor, widths: SigmaSchedule) -> Tensor:
-        """Return states (B, D + K) at the end of a descent from others."""
-        steps = {"em_steps": self.config.em_steps, "m_steps": self.config.m_steps}
-        found = anneal(problem, state, widths, **steps, on_step=self.on_step).pose
-        return fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=self.on_step).pose
-
-
-def _with_learned_spread(
-    problem: ShapeProblem, state: Tensor, alike: Tensor, on_step: OnStep | None
-) -> tuple[ShapeProblem, Tensor]:
-    """Return the problem with the deviations of alike coefficients learned, and states (T, D + K) fitted.
-
-    The deviation of greatest evidence is ``s^2 = sum_k (c_k - m_k)^2 / sum_k g_k``, ``g_k = 1 - C_kk / s^2`` with the
-    covariance C (MacKay 1992, eq. 4.9); the prior's guess counts as one more coefficient.
-    """
-    space, dofs = problem.skin.shape.space, problem.skin.shape.rig.num_dofs
-    member = alike.unsqueeze(-1) == alike.clamp_min(0).unique()
-    group = member.to(state)
-    for _ in range(SHAPE_FIT.spread_steps):
-        precision = problem.prior.precision[dofs:] * problem.scans
-        covariance = shared_covariance(_covariance(problem, state), dofs)
-        told = (1 - covariance.diagonal() * precision).clamp(0, 1)
-        squares = (state[0, dofs:] - space.mean).square() @ group + (space.std.square() @ group) / group.sum(0)
-        variance = squares / (told @ group + 1)
-        learned = torch.where(member.any(-1), (group @ variance.reciprocal()), precision) / problem.scans
-        joined = torch.cat([problem.prior.precision[:dofs], learned])
-        problem = replace(problem, prior=replace(problem.prior, precision=joined))
-        widths = SURFACE_FIT.widths[-1:]
-        state = fit_surface(problem, state, steps=SHAPE_FIT.fine_steps, widths=widths, on_step=on_step).pose
-    return problem, state
-
-
 def shared_covariance(covariance: Tensor, num_dofs: int) -> Tensor:
     """Return the covariance (K, K) of coefficients from scans' (T, D + K, D + K), each with its prior's share."""
     alone = covariance[:, num_dofs:, num_dofs:].double()
     return torch.linalg.inv(torch.linalg.inv(alone).sum(0)).to(covariance)
 
 
-def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRecord) -> None:
-    """Pass on a record with the poses alone, in the coordinates of the data."""
-    scans = len(record.pose) // problem.scans
-    origin = pad(problem.origin[: problem.scans].repeat(scans, 1), (0, num_dofs - 3))
-    on_step(normal_copy(replace(record, pose=record.pose[:, :num_dofs] + origin)))
-
-
-def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs: int) -> FittedShape:
+def fitted_shape(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs: int) -> FittedShape:
     """Return the end of a fit, whose last step began in states (T, D + K)."""
     poses, coefficients = found.pose.tensor_split([num_dofs], dim=-1)
-    covariance = _covariance(problem, found.pose)
+    covariance = state_covariance(problem, found.pose)
     return FittedShape(
         poses=poses + pad(problem.origin, (0, num_dofs - 3)),
         coefficients=coefficients[0],
@@ -260,7 +126,7 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
     return SurfaceError(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
 
 
-def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
+def state_covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
     """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
     rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
     precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
@@ -307,7 +173,7 @@ def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
     return drawn[groups.gather(1, unlikely[groups].argmin(1, keepdim=True))[:, 0]]
 
 
-def _problem(
+def shape_problem(
     shape: ArticulatedShape,
     data: Tensor,
     valid: Tensor,
@@ -320,7 +186,7 @@ def _problem(
     """Return the problem of S people in T scans, S T rows about the scans' means, and its start."""
     if poses is None:
         rest = shape.rest_pose().unsqueeze(0)
-        problem, start = _problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
+        problem, start = shape_problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
         return _found(problem, shape, start[:, shape.num_dofs :], generator, config.upright)
     space, surface = shape.coefficient_space(), shape.file_surface()
     people = different_people(space, generator)

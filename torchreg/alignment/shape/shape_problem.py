@@ -11,6 +11,7 @@ from torchreg.alignment.fit.objectives import Objective
 from torchreg.alignment.fit.problem import AlignProblem, alignment_cost
 from torchreg.shapes.shaped import ShapedSkin
 from torchreg.shapes.shaped_surface import ShapedSurface
+from torchreg.solvers.arrow import join_shared
 from torchreg.solvers.levenberg_marquardt import (
     Linearization,
     LMResult,
@@ -106,19 +107,7 @@ class ShapeProblem(AlignProblem):
 
     def _joined(self, rows: Linearization) -> Linearization:
         """Return the least-squares problem (S, T D + K) of people from that of their scans (S T, D + K)."""
-        dofs, scans = self._dofs, self.scans
-        gradient, hessian = (value.unflatten(0, (-1, scans)) for value in (rows.gradient, rows.hessian))
-        poses = hessian.new_zeros(len(hessian), scans, dofs, scans, dofs)
-        index = torch.arange(scans)
-        poses[:, index, :, index] = hessian[..., :dofs, :dofs].transpose(0, 1)
-        across = hessian[..., :dofs, dofs:].flatten(1, 2)
-        corner = hessian[..., dofs:, dofs:].sum(1)
-        top = torch.cat([poses.flatten(3, 4).flatten(1, 2), across], dim=-1)
-        return Linearization(
-            cost=rows.cost.unflatten(0, (-1, scans)).sum(-1),
-            gradient=torch.cat([gradient[..., :dofs].flatten(1), gradient[..., dofs:].sum(1)], dim=-1),
-            hessian=torch.cat([top, torch.cat([across.mT, corner], dim=-1)], dim=1),
-        )
+        return join_shared(Linearization(*(value.unflatten(0, (-1, self.scans)) for value in rows)), self._dofs)
 
     def _spread(self, found: LMResult) -> LMResult:
         """Return a result over people as one over their scans."""

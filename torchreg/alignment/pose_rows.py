@@ -1,0 +1,194 @@
+"""The rows of a batch of alignments, from their starts to their judgement."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import warn_about_rounding
+from torchreg.alignment.assembly import assembled
+from torchreg.alignment.evidence.curvature import curvature
+from torchreg.alignment.evidence.reliability import SurfaceError, without_cut
+from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
+from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal
+from torchreg.alignment.fit.problem import AlignProblem, alignment_cost, centered_problem, masked_mean
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.alignment.inputs import Task, check_clouds, warn_about_units
+from torchreg.alignment.results import AlignRecord, AlignResult
+from torchreg.alignment.search.local_search import explore, needs_search
+from torchreg.errors import InputError, UnitsWarning
+from torchreg.result import normal_copy
+from torchreg.shapes.pose_algebra import shifted
+from torchreg.shapes.skin import LinearBlendSkin
+
+# Poses of a search, of which rivals are told: a box looks alike from as many sides.
+_NUM_STARTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """B alignments in centered coordinates: starts (B, num_dofs), origins (B, 3), poses found, records of all steps.
+
+    `uncropped` is the problem without what a crop cuts off, as a forearm; `lead` (B,) and `rivals` (B, R, num_dofs) are
+    those of a search. The rows are those of ``batched`` clouds, or of several starts in one.
+    """
+
+    task: Task
+    problem: AlignProblem
+    uncropped: AlignProblem
+    start: Tensor
+    origin: Tensor
+    found: StageResult
+    batched: bool
+    history: list[AlignRecord] = field(default_factory=list)
+    lead: Tensor | None = None
+    rivals: Tensor | None = None
+
+    @classmethod
+    def of(cls, task: Task) -> PoseRows:
+        """Return the rows of the starts of a task: given, known, or found by a search."""
+        shape, config, start, lead, rivals = task.shape, task.config, task.start, None, None
+        task = replace(task, seen=task.seen.drawn(shape, config.nan_policy, config.seed))
+        if start is None and task.known is not None and task.known.places_base:
+            start = task.known.start(shape)
+        if start is None:
+            search = _search(task)
+            start, lead, rivals = search.starts.best, search.lead, search.rivals
+        with torch.inference_mode():
+            clouds, valid = check_clouds(shape, task.seen.points, task.seen.mask, config.nan_policy)
+            pose = task.starts(clouds, start)
+            rows = cls.centered(task, task.skin(pose), clouds, valid, pose)  # the skin's points are the X_i of eq. 3
+            problem = rows.problem if task.known is None else task.known.with_prior(rows.problem, rows.start)
+            warn_about_rounding(clouds, "data", problem.size, stacklevel=5)
+            warn_about_units(problem.data, problem.valid, problem.size, stacklevel=5)
+            return replace(rows, problem=problem, uncropped=problem, lead=lead, rivals=rivals)
+
+    @classmethod
+    def centered(cls, task: Task, skin: LinearBlendSkin, clouds: Tensor, valid: Tensor, pose: Tensor) -> PoseRows:
+        """Return rows of clouds ((B,) M, 3) from starts (B, num_dofs), each about the mean of its data."""
+        config, data = task.config, clouds.expand(len(pose), *clouds.shape[-2:])
+        valid = valid.expand(len(pose), valid.shape[-1])
+        origin, free_space = masked_mean(data, valid), task.seen.free_space
+        if free_space is not None and len(free_space.picture) < len(pose):
+            free_space = free_space.rows(torch.zeros(len(pose), dtype=torch.int64, device=free_space.picture.device))
+        problem = centered_problem(
+            skin, data, valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
+            outlier=config.outlier, debias=config.debias, correspondence=config.correspondence, free_space=free_space,
+            keypoints=task.seen.keypoints,
+        )  # fmt: skip
+        start, none = shifted(pose, -origin), torch.full_like(pose[:, 0], torch.inf)
+        found = StageResult(pose=start, sigma=none, change=none)
+        return cls(task, problem, problem, start, origin, found, batched=clouds.ndim == 3)
+
+    def record(self, step: AlignRecord) -> None:
+        """Keep the record of a step and pass it on, with poses in the coordinates of the data."""
+        step = normal_copy(replace(step, pose=shifted(step.pose, self.origin)))
+        self.history.append(step)
+        if self.task.on_step is not None:
+            with torch.inference_mode(False), torch.no_grad():
+                self.task.on_step(step)
+
+    def rows(self, index: Tensor) -> PoseRows:
+        """Return some rows of the batch."""
+        problem = self.problem.rows(index)
+        uncropped = problem if self.uncropped is self.problem else self.uncropped.rows(index)
+        start, origin, found = self.start[index], self.origin[index], self.found.rows(index)
+        return replace(self, problem=problem, uncropped=uncropped, start=start, origin=origin, found=found)
+
+    def annealed(self) -> PoseRows:
+        """Return the rows after the annealed EM from the starts."""
+        config, schedule = self.task.config, self.task.config.schedule or ANNEALING.schedule(self.problem.size)
+        steps = {"em_steps": config.em_steps, "m_steps": config.m_steps}
+        return replace(self, found=anneal(self.problem, self.start, schedule, **steps, on_step=self.record))
+
+    def fitted(self) -> PoseRows:
+        """Return the rows after a surface fit, of several starts in one cloud the best; sigma stays the posterior's."""
+        rows = self
+        if self.task.config.surface_steps:
+            fit = fit_surface(self.problem, self.found.pose, steps=self.task.config.surface_steps, on_step=self.record)
+            rows = replace(self, found=replace(fit, sigma=self.found.sigma))
+        if self.batched or len(self.start) == 1:
+            return rows
+        return rows.rows(alignment_cost(rows.problem, rows.found.pose).argmin().unsqueeze(0))
+
+    def restarted(self) -> PoseRows:
+        """Return the rows, from other starts where that is better: one found, or around one not to be trusted."""
+        found, config = self, self.task.config
+        if self.lead is not None and config.surface_steps:
+            # An EM may draw one-sided data inwards.
+            found = self._refitted(self.start, on_step=None)
+        if config.search == "never":
+            return found
+        index = torch.arange(len(self.start), device=self.start.device)
+        if config.search == "auto":
+            index = needs_search(self.problem, self.start, found.found.pose).nonzero()[:, 0]
+        if len(index) == 0:
+            return found
+        rows, generator = found.rows(index), torch.Generator().manual_seed(config.seed)
+        explored = explore(
+            rows.problem, rows.start, rows.found.pose, candidates=config.num_candidates, rounds=config.search_rounds,
+            generator=generator,
+        )  # fmt: skip
+        return found._joined(index, rows._refitted(explored, on_step=rows.record))
+
+    def finished(self) -> PoseRows:
+        """Return the rows fitted without what a crop cuts off, and to the end where another step would still gain."""
+        rows = replace(self, uncropped=without_cut(self.problem, self.found.pose, self.task.seen.frames))
+        if self.task.config.surface_steps == 0:
+            return rows
+        if bool((rows.uncropped.valid != self.problem.valid).any()):
+            rows = rows._refitted(self.found.pose, on_step=self.record, if_better=False)
+        index = (rows.found.change > self.task.config.pose_atol).nonzero()[:, 0]
+        if self.task.config.search == "never" or len(index) == 0:
+            return rows
+        index = index[~curvature(rows.uncropped.rows(index), rows.found.pose[index]).converged]
+        if len(index) == 0:
+            return rows
+        left, steps = rows.rows(index), SURFACE_FIT.more_steps
+        more = left._refitted(left.found.pose, on_step=left.record, if_better=False, steps=steps, widths=())
+        return rows._joined(index, more)
+
+    def judged(self, error: SurfaceError | None = None) -> AlignResult:
+        """Return the result, see `assembled`: inliers by eq. 2, the posterior by eq. 17."""
+        return normal_copy(assembled(self, error))
+
+    def _refitted(
+        self,
+        start: Tensor,
+        *,
+        on_step: Callable[[AlignRecord], Any] | None,
+        if_better: bool = True,
+        steps: int | None = None,
+        widths: Sequence[float] = SURFACE_FIT.widths[-1:],
+    ) -> PoseRows:
+        """Return the rows fitted to the surface from other poses, where that is better, or in any case."""
+        steps = steps or max(self.task.config.surface_steps, SURFACE_FIT.search_steps)
+        found = fit_surface(self.uncropped, start, steps=steps, widths=widths, on_step=on_step)
+        pose, change = found.pose, found.change
+        if if_better:
+            better = alignment_cost(self.problem, pose) < alignment_cost(self.problem, self.found.pose)
+            pose = torch.where(better.unsqueeze(-1), pose, self.found.pose)
+            change = torch.where(better, change, self.found.change)
+        return replace(self, found=replace(self.found, pose=pose, change=change))
+
+    def _joined(self, index: Tensor, rows: PoseRows) -> PoseRows:
+        """Return the batch with other results of some rows."""
+        pose = self.found.pose.index_copy(0, index, rows.found.pose)
+        change = self.found.change.index_copy(0, index, rows.found.change)
+        return replace(self, found=replace(self.found, pose=pose, change=change))
+
+
+def _search(task: Task) -> FoundStarts:
+    """Return the poses that a search without a start finds, and the lead of the best over others."""
+    if isinstance(task.model_points, Tensor):
+        raise InputError("model_points given as a tensor need a single initial_pose, that they are in; give both")
+    points, policy, seed = task.config.num_model_points, task.config.nan_policy, task.config.seed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
+        config = FindPoseConfig(num_model_points=points, nan_policy=policy, seed=seed)
+        return search_everywhere(task, _NUM_STARTS, config)

@@ -1,0 +1,155 @@
+"""The one multi-start: candidates descend with narrowing kernels, are ranked, and the best that differ are kept."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
+from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, alignment_cost
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface_steps
+from torchreg.solvers.robust import welsch_loss
+
+
+@dataclass(frozen=True)
+class SearchBudget:
+    """Numbers of all searches; lengths are shares of the model's size."""
+
+    num_data: int = 800  # of the refinement: more tell candidates apart no better
+    num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
+    num_model_points: int = 120  # that cover the shape
+    num_compared: int = 60  # model points by which candidates are compared
+    max_ranked: int = 300  # best candidates, of which different ones are taken
+    noise: float = 0.01  # standard deviation of the data for the weight of the prior
+    cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
+    device_entries: int = 150_000_000  # of a table in memory on other devices: enough to keep them busy
+
+
+SEARCH_BUDGET = SearchBudget()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Damped steps at each of some kernel widths, then a score at one width, all shares of the model's size."""
+
+    widths: tuple[float, ...]
+    steps: int
+    score_width: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Candidates (B, K, num_dofs) of a batch of problems, best first, and their costs (B, K)."""
+
+    problem: AlignProblem
+    poses: Tensor
+    costs: Tensor
+
+    @classmethod
+    def ranked(cls, problem: AlignProblem, poses: Tensor, costs: Tensor) -> Candidates:
+        """Return candidates (B, K, num_dofs) sorted by costs (B, K)."""
+        order = costs.argsort(dim=1, stable=True)
+        return cls(problem, take_rows(poses, order), costs.gather(1, order))
+
+    @classmethod
+    def descended(cls, problem: AlignProblem, poses: Tensor, plan: Plan) -> Candidates:
+        """Return candidates (B, K, num_dofs) after a plan."""
+        return cls.ranked(problem, *descend(problem, poses, plan))
+
+    @classmethod
+    def fitted(cls, problem: AlignProblem, poses: Tensor) -> Candidates:
+        """Return candidates (B, K, num_dofs) fitted to all data down to their noise."""
+        wide = problem.repeated(poses.shape[1])
+        steps, widths = SURFACE_FIT.search_steps, SURFACE_FIT.widths[-1:]
+        fitted = fit_surface(wide, poses.flatten(0, 1), steps=steps, widths=widths).pose
+        return cls.ranked(problem, fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(poses.shape[:2]))
+
+    def apart(self, same: float) -> Tensor:
+        """Return which candidates differ (B, K, K): by more than a share of the size, on average over their points."""
+        return mean_distances(self.problem, self.poses) > same * self.problem.size
+
+    def lead(self, same: float) -> Tensor:
+        """Return the cost (B,) by which the best of different candidates is worse than the first, or infinity."""
+        return torch.where(self.apart(same)[:, 0], self.costs, torch.inf).amin(1) - self.costs[:, 0]
+
+    def distinct(self, same: float, count: int | None = None) -> Candidates:
+        """Return the best ``count`` that differ; then duplicates of them."""
+        few = self.take(slice(SEARCH_BUDGET.max_ranked))
+        order = distinct_first(~few.apart(same))[:, :count]
+        return Candidates(self.problem, take_rows(few.poses, order), few.costs.gather(1, order))
+
+    def take(self, which: slice) -> Candidates:
+        """Return some of the candidates."""
+        return Candidates(self.problem, self.poses[:, which], self.costs[:, which])
+
+    def joined(self, others: Candidates) -> Candidates:
+        """Return these candidates and others of the same problems."""
+        costs = torch.cat([self.costs, others.costs], dim=1)
+        return Candidates.ranked(self.problem, torch.cat([self.poses, others.poses], dim=1), costs)
+
+
+def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, Tensor]:
+    """Return poses (B, K, num_dofs) after the steps of a plan on the surface, and their scores (B, K)."""
+    wide, pose = problem.repeated(poses.shape[1]), poses.flatten(0, 1)
+    noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
+    for width in plan.widths:
+        pose = surface_steps(wide, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
+    poses = pose.reshape(poses.shape)
+    return poses, score_candidates(problem, poses, plan.score_width)
+
+
+def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
+    """Return the score (B, K) of poses (B, K, num_dofs), as `alignment_cost`; lower is better."""
+    distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
+    outliers = welsch_loss((distance / (width * problem.size)).square())
+    scores = (outliers * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
+    return scores + problem.factor_score(poses, width)
+
+
+def align_rows(problem: AlignProblem, poses: Tensor, count: int, same: float, generator: torch.Generator) -> Tensor:
+    """Return the best ``count`` of candidates (B, K, num_dofs) after an alignment of all their joints to few data.
+
+    The limbs of a skinned rig are not placed one after another: the solids that stand for its parts are too rough for
+    that, and bones of a spine, rather than a trunk that is found first, lie between them.
+    """
+    settings, found, candidates = AlignConfig(), [], poses.shape[1]
+    drawn = replace(problem.draw(SEARCH_BUDGET.num_data, generator), debias=settings.debias)
+    schedule, shape = ANNEALING.schedule(problem.size), problem.skin.shape
+    derivatives = candidates * shape.num_parts * problem.skin.basis.shape[-1] * shape.num_dofs
+    for rows in rows_in_memory(len(poses), derivatives, poses.device):
+        part, pose = drawn.rows(rows).repeated(candidates), poses[rows].flatten(0, 1)
+        pose = anneal(part, pose, schedule, em_steps=settings.em_steps, m_steps=settings.m_steps).pose
+        pose = fit_surface(part, pose, steps=settings.surface_steps).pose
+        costs = alignment_cost(part, pose).unflatten(0, (-1, candidates))
+        ranked = Candidates.ranked(drawn.rows(rows), pose.unflatten(0, (-1, candidates)), costs)
+        found.append(ranked.distinct(same, count).poses)
+    return torch.cat(found)
+
+
+def mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
+    """Return the distances (B, K, K) of model points, as root mean squares, between poses (B, K, num_dofs)."""
+    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_compared), :]
+    return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
+
+
+def rows_in_memory(count: int, entries: int, device: torch.device) -> tuple[Tensor, ...]:
+    """Return the indices of ``count`` problems in groups whose tables, of so many entries each, fit into memory."""
+    most = SEARCH_BUDGET.cpu_entries if device.type == "cpu" else SEARCH_BUDGET.device_entries
+    return torch.arange(count, device=device).split(max(1, most // max(1, entries)))
+
+
+def take_rows(table: Tensor, index: Tensor) -> Tensor:
+    """Return rows ``index`` (B, C) of a table (B, K, ...)."""
+    return table.gather(1, index.reshape(*index.shape, *[1] * (table.ndim - 2)).expand(*index.shape, *table.shape[2:]))
+
+
+def distinct_first(close: Tensor) -> Tensor:
+    """Return the order (B, K) that moves items to the end that are close (B, K, K) to an item kept before them."""
+    kept = torch.ones_like(close[..., 0])
+    for rank in range(1, close.shape[-1]):
+        kept[:, rank] = ~(close[:, rank, :rank] & kept[:, :rank]).any(-1)
+    return kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)
