@@ -43,6 +43,7 @@ from torchreg.alignment.search.in_picture import not_found_if_improbable, surest
 from torchreg.alignment.search.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.shape.clothing import may_be_clothed
 from torchreg.alignment.shape.person_gradient import person_with_gradients
 from torchreg.alignment.shape.shape_fit import fit_coefficients, fitted_rig
 from torchreg.capture.depth_frame import DepthFrame
@@ -76,6 +77,7 @@ def align(
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,
     fit_shape: bool | str = False,
+    clothed: bool | str = "auto",
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
     initializer: PoseProposer | HoldsProposer | None = None,
@@ -111,6 +113,8 @@ def align(
             any rig, whose coefficients are then the lengths and radii of its parts. For one cloud or depth frame
             without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients. Without
             one, people of different sizes are sought everywhere.
+        clothed: of a body of anny whose shape is fitted, whether clothes lie between its skin and the data, see
+            `AlignResult.clothing_offset`; by default where the data are likelier with clothes. Others wear none.
         keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
             beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
@@ -158,7 +162,8 @@ def align(
             model_size(skin),
             partial(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
-                keypoint_std=keypoint_std, fit_shape=fit_shape, initializer=initializer, config=config, on_step=on_step,
+                keypoint_std=keypoint_std, fit_shape=fit_shape, clothed=clothed, initializer=initializer,
+                config=config, on_step=on_step,
             ),
             partial(source.crop_score, skin),
         )  # fmt: skip
@@ -169,11 +174,12 @@ def align(
     seen, known = to_local(seen, origin), to_local(known, origin)
     start = initial_pose if origin is None or initial_pose is None else to_local(torch.as_tensor(initial_pose), origin)
     on_local_step = on_step if origin is None or on_step is None else partial(_in_world, on_step, origin)
+    clothed = may_be_clothed(shape, clothed, fit_shape)
     if fit_shape is not False:
         if initializer is not None:
             raise InputError("initializer has no meaning with fit_shape; people are sought without one")
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
-        found = _align_person(shape, seen, start, config, on_local_step)
+        found = _align_person(shape, seen, start, clothed, config, on_local_step)
         shape = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
     else:
         points = to_local(model_points, origin) if isinstance(model_points, Tensor) else model_points
@@ -223,7 +229,12 @@ def _align(
 
 
 def _align_person(
-    shape: ArticulatedShape, seen: Observation, initial_pose: Tensor | None, config: AlignConfig, on_step: OnStep | None
+    shape: ArticulatedShape,
+    seen: Observation,
+    initial_pose: Tensor | None,
+    clothed: bool | str,
+    config: AlignConfig,
+    on_step: OnStep | None,
 ) -> AlignResult:
     """Return the alignment of a rig whose coefficients are fitted together with its pose."""
     by_data = torch.is_grad_enabled() and isinstance(seen.points, Tensor) and seen.points.requires_grad
@@ -236,11 +247,10 @@ def _align_person(
     history = _History(on_step)
     viewpoints = torch.stack([frame.camera.position for frame in seen.frames]) if seen.frames else None
     fitted = fit_coefficients(
-        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=history
+        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, clothed=clothed, on_step=history
     )
-    person = shape.with_coefficients(fitted.coefficients)
     with torch.inference_mode():
-        skin = _model_skin(person, None, fitted.poses, config)
+        skin = _model_skin(fitted.person, None, fitted.poses, config)
         batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
         result = unbatched(assembled(batch, found, config, fitted.lead, batch.problem, seen, fitted.error))
@@ -252,6 +262,7 @@ def _align_person(
             covariance=fitted.covariance[0, :dofs, :dofs],
             dof_confidence=dof_confidence(shape, fitted.covariance[0, :dofs, :dofs], batch.problem.size),
             coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
+            clothing_offset=fitted.clothing,
         ))  # fmt: skip
     if not by_data:
         return result

@@ -57,7 +57,7 @@ class PersonFilter:
 
     def initialize(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
         """Return the pose (num_dofs,) and coefficients of a first frame; None where the shape is not found."""
-        found = align(self.rig, data, start, fit_shape=True, config=self._config)
+        found = align(self.rig, data, start, fit_shape=True, clothed=False, config=self._config)
         mean, covariance = found.coefficients, found.coefficient_covariance
         shows = found.statuses[0] in (Status.CONVERGED, Status.MAX_STEPS, Status.DOUBTFUL)
         if not shows or mean is None or covariance is None:

@@ -20,6 +20,8 @@ from torchreg.alignment.fit.problem import BROAD_PRIOR, joint_precision, masked_
 from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
 from torchreg.alignment.results import AlignRecord
+from torchreg.alignment.shape.clothing import ClothedSpace, clothed_rig
+from torchreg.alignment.shape.clothing_evidence import bare_where_likelier
 from torchreg.alignment.shape.person_search import find_people, lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 from torchreg.errors import InputError
@@ -70,7 +72,8 @@ class FittedShape:
     """Poses (T, D) and coefficients (K,) of a fit, with covariances (T, D + K, D + K) in tangent coordinates.
 
     `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
-    state is worse in a search.
+    state is worse in a search. `rig` has those of clothes as its last coefficients, where there may be any, of which
+    those lie off the skin by `clothing` (V,), metres.
     """
 
     poses: Tensor
@@ -82,7 +85,14 @@ class FittedShape:
     error: SurfaceError
     problem: ShapeProblem
     state: Tensor
+    rig: ArticulatedShape
+    clothing: Tensor | None = None
     lead: Tensor | None = None
+
+    @property
+    def person(self) -> ArticulatedShape:
+        """The rig of the person, whose surface is that of the clothes."""
+        return self.rig.with_coefficients(self.state[0, self.rig.num_dofs :].clone())
 
 
 def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = True) -> ArticulatedShape:
@@ -107,6 +117,7 @@ def fit_coefficients(
     *,
     config: AlignConfig,
     viewpoints: Tensor | None = None,
+    clothed: bool | str = False,
     on_step: OnStep | None = None,
 ) -> FittedShape:
     """Return the poses of T scans (T, M, 3) of one shape and the coefficients that they share.
@@ -115,6 +126,7 @@ def fit_coefficients(
     further columns of the normal equations. Poses (T, num_dofs) are at the mean coefficients; None searches one scan's.
     """
     generator = torch.Generator().manual_seed(config.seed)
+    shape = clothed_rig(shape) if clothed else shape
     problem, start = _problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
     if on_step is not None:
         on_step = partial(_tell, on_step, problem, shape.num_dofs)
@@ -140,10 +152,20 @@ def fit_coefficients(
     if alike is not None:
         fine, state = _with_learned_spread(fine, state, alike, on_step)
         problem = replace(problem, prior=replace(problem.prior, precision=fine.prior.precision))
+    space = shape.coefficient_space()
+    if isinstance(space, ClothedSpace) and clothed is not True:
+        count = len(space) - len(space.body)
+        fine, state = bare_where_likelier(fine, state, count, _fit_closely, _covariance)
+        problem = replace(problem, prior=fine.prior)
     finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
     before = finish(state, steps=SHAPE_FIT.fine_steps).pose
     last = replace(finish(before, steps=1), sigma=sigma)
-    return replace(_fitted(problem, before, last, shape.num_dofs), lead=lead)
+    return replace(_fitted(problem, before, last, shape), lead=lead)
+
+
+def _fit_closely(problem: ShapeProblem, state: Tensor) -> Tensor:
+    """Return states (T, D + K) fitted from nearly right ones."""
+    return fit_surface(problem, state, steps=SHAPE_FIT.fine_steps, widths=SURFACE_FIT.widths[-1:]).pose
 
 
 def _placed_again(problem: ShapeProblem, state: Tensor, descend: _Descent) -> Tensor:
@@ -233,13 +255,18 @@ def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRe
     on_step(normal_copy(replace(record, pose=record.pose[:, :num_dofs] + origin)))
 
 
-def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs: int) -> FittedShape:
+def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, shape: ArticulatedShape) -> FittedShape:
     """Return the end of a fit, whose last step began in states (T, D + K)."""
-    poses, coefficients = found.pose.tensor_split([num_dofs], dim=-1)
-    covariance = _covariance(problem, found.pose)
+    poses, coefficients = found.pose.tensor_split([shape.num_dofs], dim=-1)
+    space, clothing = shape.coefficient_space(), None
+    body = space.body if isinstance(space, ClothedSpace) else space
+    if isinstance(space, ClothedSpace) and bool((problem.prior.mean[0, shape.num_dofs + len(body) :] != 0).any()):
+        clothing = space.clothing_offset(coefficients[0])
+    known = shape.num_dofs + len(body)
+    covariance = _covariance(problem, found.pose)[:, :known, :known]
     return FittedShape(
-        poses=poses + pad(problem.origin, (0, num_dofs - 3)),
-        coefficients=coefficients[0],
+        poses=poses + pad(problem.origin, (0, shape.num_dofs - 3)),
+        coefficients=coefficients[0, : len(body)],
         covariance=covariance,
         cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
@@ -247,6 +274,8 @@ def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs:
         error=_surface_error(problem, before, found.pose, covariance),
         problem=problem,
         state=found.pose,
+        rig=shape,
+        clothing=clothing,
     )
 
 
@@ -254,7 +283,7 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
     """Return the standard errors of the surface in states (T, D + K), by their covariance, and their last step."""
     rows, moves = problem.skin.row_jacobian(state)
     moved = (problem.skin.place(rows) - problem.skin(before)).square().sum(-1).mean(-1).sqrt()
-    variances = end_variances(moves, covariance)
+    variances = end_variances(moves[..., : covariance.shape[-1]], covariance)
     owned = torch.nn.functional.one_hot(problem.skin.weights.argmax(-1), problem.skin.weights.shape[1]).to(variances)
     by_part = variances @ owned / owned.sum(0).clamp_min(1)
     return SurfaceError(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
@@ -323,7 +352,8 @@ def _problem(
         problem, start = _problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
         return _found(problem, shape, start[:, shape.num_dofs :], generator, config.upright)
     space, surface = shape.coefficient_space(), shape.file_surface()
-    people = different_people(space, generator)
+    people = different_people(space.body if isinstance(space, ClothedSpace) else space, generator)
+    people = torch.cat([people, space.mean[people.shape[-1] :].expand(len(people), -1)], dim=-1)
     tree = ShapedTree(shape, space)
     normals = torch.stack([
         scan_normals(points, told, None if viewpoints is None else viewpoints[number])
