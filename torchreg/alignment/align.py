@@ -43,7 +43,7 @@ from torchreg.alignment.search.in_picture import not_found_if_improbable, surest
 from torchreg.alignment.search.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
-from torchreg.alignment.shape.clothing import may_be_clothed
+from torchreg.alignment.shape.clothing import clothed_rig, may_be_clothed
 from torchreg.alignment.shape.person_gradient import person_with_gradients
 from torchreg.alignment.shape.shape_fit import fit_coefficients, fitted_rig
 from torchreg.capture.depth_frame import DepthFrame
@@ -245,9 +245,12 @@ def _align_person(
             raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
     pose = None if initial_pose is None else _check_start(shape, initial_pose, clouds[None])[0]
     history = _History(on_step)
+    if clothed:
+        with torch.no_grad():
+            shape = clothed_rig(shape, surely=clothed is True)
     viewpoints = torch.stack([frame.camera.position for frame in seen.frames]) if seen.frames else None
     fitted = fit_coefficients(
-        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, clothed=clothed, on_step=history
+        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=history
     )
     with torch.inference_mode():
         skin = _model_skin(fitted.person, None, fitted.poses, config)

@@ -60,12 +60,13 @@ class ClothedSpace(ShapeSpace):
         normals: (V, 3) of the skin at rest.
         modes: (V, M) by which the offset varies along them, metres, of a standard deviation of one.
         worn: (M,) coefficients of the mean clothes.
+        surely: whether there are any.
     """
 
     normals: Tensor
     modes: Tensor
 
-    def __init__(self, body: ShapeSpace, normals: Tensor, modes: Tensor, worn: Tensor) -> None:
+    def __init__(self, body: ShapeSpace, normals: Tensor, modes: Tensor, worn: Tensor, *, surely: bool = True) -> None:
         prior, one = body.prior, torch.ones_like(worn)
         reach = CLOTH.reach * one + worn.abs()
         super().__init__(CoefficientPrior(
@@ -73,7 +74,7 @@ class ClothedSpace(ShapeSpace):
             mean=torch.cat([prior.mean, worn]), std=torch.cat([prior.std, one]),
             lower=torch.cat([prior.lower, -reach]), upper=torch.cat([prior.upper, reach]),
         ))  # fmt: skip
-        self.body = body
+        self.body, self.surely = body, surely
         self.register_buffer("normals", normals, persistent=False)
         self.register_buffer("modes", modes, persistent=False)
 
@@ -92,7 +93,9 @@ class ClothedSpace(ShapeSpace):
     def restricted(self, index: Tensor) -> ClothedSpace:
         """Return the space with some of the vertices only, by index (U,)."""
         worn = self.mean[len(self.body) :]
-        return ClothedSpace(self.body.restricted(index), self.normals[index], self.modes[index], worn)
+        return ClothedSpace(
+            self.body.restricted(index), self.normals[index], self.modes[index], worn, surely=self.surely
+        )
 
     def clothing_offset(self, coefficients: Tensor) -> Tensor:
         """Return how far clothes lie off the skin (..., V), metres; they are nowhere inside it."""
@@ -113,7 +116,7 @@ def may_be_clothed(shape: ArticulatedShape, clothed: bool | str, fit_shape: bool
     return clothed if is_body else False
 
 
-def clothed_rig(shape: ArticulatedShape) -> ArticulatedShape:
+def clothed_rig(shape: ArticulatedShape, *, surely: bool = True) -> ArticulatedShape:
     """Return a body with clothes: the leading modes of a Gaussian process on its skin as further coefficients."""
     surface, space = shape.file_surface(), shape.coefficient_space()
     region = torch.tensor([
@@ -138,5 +141,6 @@ def clothed_rig(shape: ArticulatedShape) -> ArticulatedShape:
     worn = vectors.mT @ mean[chosen] / values.sqrt()
     normals = TriangleMesh(points, surface.faces.cpu()).vertex_normals()
     other = copy.deepcopy(shape)
-    other.space = ClothedSpace(space, *(value.to(space.mean) for value in (normals, modes, worn)))
+    cloth = (value.to(space.mean) for value in (normals, modes, worn))
+    other.space = ClothedSpace(space, *cloth, surely=surely)
     return other

@@ -11,7 +11,7 @@ from torchreg.alignment.fit.implicit_gradient import FixedPoint, attach_gradient
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.alignment.shape.shape_fit import FittedShape
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.shaped import ShapedSkin
+from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ def person_with_gradients(
         surface, data = problem.surface, problem.data.clone()
         distance, nearest = surface.nearest(data, state.clone())
         noise = surface_noise(distance, problem.valid, problem.size)
+        tree = ShapedTree(fitted.rig, fitted.rig.coefficient_space())
         dense = surface.shaped
-        tree = dense.shape
         index = nearest[0]
         planes = PairedPlanes(ShapedSkin(tree, dense.vertex_index(index), dense.shares[index], dense.weights[index]))
         # Data off the rim or of the other side are no evidence.

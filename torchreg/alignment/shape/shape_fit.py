@@ -20,7 +20,7 @@ from torchreg.alignment.fit.problem import BROAD_PRIOR, joint_precision, masked_
 from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
 from torchreg.alignment.results import AlignRecord
-from torchreg.alignment.shape.clothing import ClothedSpace, clothed_rig
+from torchreg.alignment.shape.clothing import ClothedSpace
 from torchreg.alignment.shape.clothing_evidence import bare_where_likelier
 from torchreg.alignment.shape.person_search import find_people, lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_problem import ShapeProblem
@@ -117,7 +117,6 @@ def fit_coefficients(
     *,
     config: AlignConfig,
     viewpoints: Tensor | None = None,
-    clothed: bool | str = False,
     on_step: OnStep | None = None,
 ) -> FittedShape:
     """Return the poses of T scans (T, M, 3) of one shape and the coefficients that they share.
@@ -126,7 +125,6 @@ def fit_coefficients(
     further columns of the normal equations. Poses (T, num_dofs) are at the mean coefficients; None searches one scan's.
     """
     generator = torch.Generator().manual_seed(config.seed)
-    shape = clothed_rig(shape) if clothed else shape
     problem, start = _problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
     if on_step is not None:
         on_step = partial(_tell, on_step, problem, shape.num_dofs)
@@ -153,7 +151,7 @@ def fit_coefficients(
         fine, state = _with_learned_spread(fine, state, alike, on_step)
         problem = replace(problem, prior=replace(problem.prior, precision=fine.prior.precision))
     space = shape.coefficient_space()
-    if isinstance(space, ClothedSpace) and clothed is not True:
+    if isinstance(space, ClothedSpace) and not space.surely:
         count = len(space) - len(space.body)
         fine, state = bare_where_likelier(fine, state, count, _fit_closely, _covariance)
         problem = replace(problem, prior=fine.prior)
