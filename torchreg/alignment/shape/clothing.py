@@ -78,6 +78,11 @@ class ClothedSpace(ShapeSpace):
         self.register_buffer("normals", normals, persistent=False)
         self.register_buffer("modes", modes, persistent=False)
 
+    @property
+    def worn(self) -> Tensor:
+        """Coefficients (M,) of the mean clothes."""
+        return self.mean[len(self.body) :]
+
     def rest(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rest state for coefficients, see `ShapeSpace.rest`."""
         vertices, frames = self.body.rest(coefficients[..., : len(self.body)])
@@ -92,9 +97,8 @@ class ClothedSpace(ShapeSpace):
 
     def restricted(self, index: Tensor) -> ClothedSpace:
         """Return the space with some of the vertices only, by index (U,)."""
-        worn = self.mean[len(self.body) :]
         return ClothedSpace(
-            self.body.restricted(index), self.normals[index], self.modes[index], worn, surely=self.surely
+            self.body.restricted(index), self.normals[index], self.modes[index], self.worn, surely=self.surely
         )
 
     def clothing_offset(self, coefficients: Tensor) -> Tensor:
