@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.problem import joint_precision, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.shape.shape_fit import fitted_rig, plausible_precision, robust_rows, scan_normals, surface_skins
@@ -90,6 +91,25 @@ class PersonFilter:
         gained = hessian[dofs:, dofs:] - across.mT @ torch.linalg.solve(by_pose, across)
         covariance = torch.linalg.inv(information + 0.5 * (gained + gained.mT))
         return KnownPerson(state[0, dofs:], covariance.to(person.covariance))
+
+    def surface_error(
+        self, person: KnownPerson, data: Tensor, pose: Tensor, last_step: Tensor, viewpoint: Tensor | None = None
+    ) -> SurfaceError:
+        """Return the standard errors of the surface in a frame (M, 3), with the last step of its fit.
+
+        They are those of pose and coefficients together, of which the frames before know the latter.
+        """
+        dofs, valid = self.rig.num_dofs, torch.ones_like(data[:, 0], dtype=torch.bool)
+        surface = ShapedSurface(
+            self._skin, scan_normals(data, valid, viewpoint)[None], SURFACE_FIT.max_width * self._size
+        )
+        state = torch.cat([pose, person.coefficients.to(pose)])[None]
+        hessian, _ = self._normal_equations(surface, data, valid, state)
+        known = torch.block_diag(self._precision.diag(), torch.linalg.inv(person.covariance.double()))
+        covariance = torch.linalg.inv(hessian + known)[None].to(pose)
+        _, moves = self._skin.row_jacobian(state)
+        moved = (moves[..., :dofs] @ last_step).square().sum(-1).mean(-1).sqrt()
+        return SurfaceError.of(self._skin, moves, covariance, moved)
 
     def differs(self, first: Tensor, second: Tensor) -> bool:
         """Return whether two people with coefficients (K,) differ, at rest, by more than a model is exact."""

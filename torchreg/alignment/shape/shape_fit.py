@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.clusters import leaves_clusters
-from torchreg.alignment.evidence.confidence import EVIDENCE, end_variances
+from torchreg.alignment.evidence.confidence import EVIDENCE
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.annealed_em import ANNEALING, OnStep, StageResult, anneal
@@ -281,10 +281,7 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
     """Return the standard errors of the surface in states (T, D + K), by their covariance, and their last step."""
     rows, moves = problem.skin.row_jacobian(state)
     moved = (problem.skin.place(rows) - problem.skin(before)).square().sum(-1).mean(-1).sqrt()
-    variances = end_variances(moves[..., : covariance.shape[-1]], covariance)
-    owned = torch.nn.functional.one_hot(problem.skin.weights.argmax(-1), problem.skin.weights.shape[1]).to(variances)
-    by_part = variances @ owned / owned.sum(0).clamp_min(1)
-    return SurfaceError(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
+    return SurfaceError.of(problem.skin, moves[..., : covariance.shape[-1]], covariance, moved)
 
 
 def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
