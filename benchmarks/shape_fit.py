@@ -33,7 +33,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchreg as tr
 from experiments.made_up.clothes import Outfit, dressed

@@ -18,8 +18,9 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.found_frames import FramePoses
 from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.results import Calibration
+from torchreg.alignment.shape.person_covariance import shared_covariance
 from torchreg.alignment.shape.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
-from torchreg.alignment.shape.shape_fit import fit_coefficients, shared_covariance
+from torchreg.alignment.shape.shape_fit import fit_coefficients
 from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape

@@ -12,16 +12,16 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.clusters import leaves_clusters
 from torchreg.alignment.evidence.confidence import EVIDENCE
-from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.annealed_em import ANNEALING, OnStep, StageResult, anneal
 from torchreg.alignment.fit.objectives import GaussianPosePrior
-from torchreg.alignment.fit.problem import BROAD_PRIOR, joint_precision, masked_mean, model_size
+from torchreg.alignment.fit.problem import joint_precision, masked_mean, model_size
 from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
-from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.shape.clothing import ClothedSpace
 from torchreg.alignment.shape.clothing_evidence import bare_where_likelier
+from torchreg.alignment.shape.person_covariance import noise_covariance, shared_covariance, with_errors_of_parts
 from torchreg.alignment.shape.person_search import find_people, lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 from torchreg.errors import InputError
@@ -32,12 +32,10 @@ from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.upright import Direction
 from torchreg.result import normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
 from torchreg.shapes.spec import RigSurface
-from torchreg.solvers.robust import welsch_weight
 
 if TYPE_CHECKING:
     from torchreg.alignment.config import AlignConfig
@@ -153,7 +151,7 @@ def fit_coefficients(
     space = shape.coefficient_space()
     if isinstance(space, ClothedSpace) and not space.surely:
         count = len(space) - len(space.body)
-        fine, state = bare_where_likelier(fine, state, count, _fit_closely, _covariance)
+        fine, state = bare_where_likelier(fine, state, count, _fit_closely, noise_covariance)
         problem = replace(problem, prior=fine.prior)
     finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
     before = finish(state, steps=SHAPE_FIT.fine_steps).pose
@@ -228,7 +226,7 @@ def _with_learned_spread(
     group = member.to(state)
     for _ in range(SHAPE_FIT.spread_steps):
         precision = problem.prior.precision[dofs:] * problem.scans
-        covariance = shared_covariance(_covariance(problem, state), dofs)
+        covariance = shared_covariance(noise_covariance(problem, state), dofs)
         told = (1 - covariance.diagonal() * precision).clamp(0, 1)
         squares = (state[0, dofs:] - space.mean).square() @ group + (space.std.square() @ group) / group.sum(0)
         variance = squares / (told @ group + 1)
@@ -238,12 +236,6 @@ def _with_learned_spread(
         widths = SURFACE_FIT.widths[-1:]
         state = fit_surface(problem, state, steps=SHAPE_FIT.fine_steps, widths=widths, on_step=on_step).pose
     return problem, state
-
-
-def shared_covariance(covariance: Tensor, num_dofs: int) -> Tensor:
-    """Return the covariance (K, K) of coefficients from scans' (T, D + K, D + K), each with its prior's share."""
-    alone = covariance[:, num_dofs:, num_dofs:].double()
-    return torch.linalg.inv(torch.linalg.inv(alone).sum(0)).to(covariance)
 
 
 def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRecord) -> None:
@@ -261,15 +253,15 @@ def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, shape: Ar
     if isinstance(space, ClothedSpace) and bool((problem.prior.mean[0, shape.num_dofs + len(body) :] != 0).any()):
         clothing = space.clothing_offset(coefficients[0])
     known = shape.num_dofs + len(body)
-    covariance = _covariance(problem, found.pose)[:, :known, :known]
+    covariance = noise_covariance(problem, found.pose)
     return FittedShape(
         poses=poses + pad(problem.origin, (0, shape.num_dofs - 3)),
         coefficients=coefficients[0, : len(body)],
-        covariance=covariance,
+        covariance=with_errors_of_parts(problem, found.pose, covariance)[:, :known, :known],
         cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
-        error=_surface_error(problem, before, found.pose, covariance),
+        error=_surface_error(problem, before, found.pose, covariance[:, :known, :known]),
         problem=problem,
         state=found.pose,
         rig=shape,
@@ -282,41 +274,6 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
     rows, moves = problem.skin.row_jacobian(state)
     moved = (problem.skin.place(rows) - problem.skin(before)).square().sum(-1).mean(-1).sqrt()
     return SurfaceError.of(problem.skin, moves[..., : covariance.shape[-1]], covariance, moved)
-
-
-def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
-    """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
-    rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
-    precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
-    return pose_covariance(rows.jacobian, rows.weights, rows.noise, precision.expand_as(state))
-
-
-@dataclass(frozen=True)
-class RobustRows:
-    """Distances (B, M) in metres, Jacobian (B, M, D + K) and Welsch weights of data as rows of a least-squares problem.
-
-    `noise` (B,) is the deviation of each datum as if all were independent: larger where neighbors err together.
-    """
-
-    distance: Tensor
-    jacobian: Tensor
-    weights: Tensor
-    noise: Tensor
-
-
-def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor, size: float) -> RobustRows:
-    """Return data (B, M, 3) as rows of a least-squares problem in states (B, D + K) of poses and coefficients."""
-    distance, jacobian = surface.distance_jacobian(data, state)
-    noise = surface_noise(distance, valid, size)
-    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * valid
-    shared = correlated_count(neighbor_correlation(data, distance, near))
-    return RobustRows(distance, jacobian=jacobian, weights=near, noise=noise * shared.clamp_min(1).sqrt())
-
-
-def plausible_precision(rig: Articulation, size: float, precision: Tensor) -> Tensor:
-    """Return the precision (D + K,) of a prior, of the pose at least that of any plausible one."""
-    broad = BROAD_PRIOR.precision(rig, size)
-    return torch.maximum(precision, pad(broad, (0, precision.shape[-1] - rig.num_dofs)))
 
 
 def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
