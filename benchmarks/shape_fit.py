@@ -8,6 +8,7 @@ hidden ones too, from its true place. Needs `pip install "torchreg-articulated[a
 
     python benchmarks/shape_fit.py                             # bodies, 10 seeds
     python benchmarks/shape_fit.py --kind hand.R
+    python benchmarks/shape_fit.py --clothed                   # in shirt and trousers, and bare; also --whole
     python benchmarks/shape_fit.py --rivals 2                  # also the rivals, on the first two seeds
     python benchmarks/shape_fit.py --part search --seeds 20    # people who are found without a start; also --upright
     python benchmarks/shape_fit.py --part shared               # several scans of one person
@@ -32,7 +33,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.clothes import Outfit, dressed
 from torchreg.geometry.mesh import interpolate, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import so3_exp, so3_log
@@ -51,6 +55,8 @@ PIXELS, DISTANCE, HEIGHT = 700, 1.7, 0.1
 KINDS = {"body": (0.003, 0.1, 15.0), "hand.R": (0.001, 0.01, 3.0), "hand.L": (0.001, 0.01, 3.0)}
 # Of people found without a start, a share of the size: 25 mm of 1.7 m; and how many of them, at least.
 FOUND, FOUND_BAR = 0.015, 0.8
+# Of clothed people, millimeters: from one side and as a whole, and what no result that is sure may exceed.
+CLOTHED_BARS, SURE_BAR = {False: 25.0, True: 20.0}, 40.0
 # Of the shared fit: height of a person in metres.
 HEIGHT_BAR = 0.02
 # Of bones: growth of the whole, of radii, standard deviation of joints in radians, noise as a share of the diagonal.
@@ -99,7 +105,18 @@ def one_sided_scan(mesh: tr.TriangleMesh, noise: float, count: int, generator: t
     seen = (picture.face_index >= 0).nonzero()
     row, column = seen[torch.randperm(len(seen), generator=generator)[:count]].unbind(1)
     face, shares = picture.face_index[row, column], picture.barycentric[row, column]
-    points = interpolate(mesh.vertices, mesh.faces, face, shares)
+    return measured(mesh, interpolate(mesh.vertices, mesh.faces, face, shares), noise, generator)
+
+
+def whole_scan(mesh: tr.TriangleMesh, noise: float, count: int, generator: torch.Generator) -> Tensor:
+    """Return points (M, 3) of all sides of a mesh, with noise and outliers."""
+    return measured(mesh, sample_surface(mesh, count, generator=generator)[0], noise, generator)
+
+
+def measured(mesh: tr.TriangleMesh, points: Tensor, noise: float, generator: torch.Generator) -> Tensor:
+    """Return points (M, 3) of a mesh with noise, and outliers."""
+    low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
+    size = float((high - low).norm())
     points = points + noise * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     outliers = round(len(points) * OUTLIER_SHARE / (1 - OUTLIER_SHARE))
     low, high = low - MARGIN * size, high + MARGIN * size
@@ -107,9 +124,10 @@ def one_sided_scan(mesh: tr.TriangleMesh, noise: float, count: int, generator: t
 
 
 def make_person(
-    model: Any, kind: str, part: str, seed: int, phenotypes: Tensor | None = None, count: int = NUM_POINTS
-) -> Person:
-    """Return a random person in a random pose, scanned."""
+    model: Any, kind: str, part: str, seed: int, phenotypes: Tensor | None = None, count: int = NUM_POINTS,
+    clothes: Tensor | None = None, *, whole: bool = False,
+) -> Person:  # fmt: skip
+    """Return a random person in a random pose, in clothes (V,) off the skin by metres, scanned from one side or all."""
     noise, place, _ = KINDS[kind]
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.rand(len(model.phenotype_labels), generator=generator).double()
@@ -124,7 +142,8 @@ def make_person(
         posed = model(pose_parameters=deltas[None], phenotype_kwargs=phenotypes[None])
     vertices = posed["vertices"][0]
     mesh = tr.TriangleMesh(vertices, model.get_triangular_faces().long())
-    data = one_sided_scan(mesh, noise, count, generator)
+    mesh = mesh if clothes is None else dressed(mesh, clothes)
+    data = (whole_scan if whole else one_sided_scan)(mesh, noise, count, generator)
     offset = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0).double() * place
     anchor = posed["bone_poses"][0, model.bone_labels.index(part), :3, 3]
     return Person(phenotypes, deltas=deltas, vertices=vertices, data=data, anchor=anchor, offset=offset)
@@ -205,6 +224,31 @@ def compare(kind: str, seeds: int, rivals: int) -> bool:
                   f"{within} of {len(values)} within {bar:g} mm")  # fmt: skip
     ours = errors["torchreg, pose and shape"]
     return sum(ours) / len(ours) <= bar
+
+
+def clothed(seeds: int, count: int, *, whole: bool) -> bool:
+    """Print the errors of people in clothes and of bare ones, with and without a model of clothes; True within bars."""
+    model, shape = load_model("body"), tr.ArticulatedShape.from_anny("body")
+    mean, bar, errors, lies = shape.with_coefficients(shape.space.mean), CLOTHED_BARS[whole], {}, 0
+    for seed, worn in product(range(seeds), (True, False)):
+        generator = torch.Generator().manual_seed(1000 + seed)
+        clothes = Outfit.random(generator).offset(mean, generator) if worn else None
+        person = make_person(model, "body", shape.part_names[0], seed, count=count, clothes=clothes, whole=whole)
+        start, told = start_pose(model, shape, person), []
+        for option in (False, "auto"):
+            result = tr.align(shape, person.data.to(shape.rest), start, fit_shape=True, clothed=option)
+            error = error_mm(shape.vertices(result.pose, result.coefficients), person)
+            errors.setdefault((worn, option), []).append(error)
+            lies += option == "auto" and error > SURE_BAR and result.status is tr.Status.CONVERGED
+            told.append(f"{error:.1f} mm (confidence {float(result.confidence):.2f}, {result.status.value})")
+        found = "clothes found" if result.clothing_offset is not None else "no clothes found"
+        print(f"seed {seed}, {'clothed' if worn else 'bare'}: without clothes {told[0]}, by default {told[1]}, {found}",
+              flush=True)  # fmt: skip
+    for (worn, option), values in errors.items():
+        print(f"{'clothed' if worn else 'bare'} people, clothed={option!r}: mean {sum(values) / seeds:.1f} mm, worst "
+              f"{max(values):.1f} mm")  # fmt: skip
+    print(f"{lies} converged and off by more than {SURE_BAR:g} mm")
+    return sum(errors[True, "auto"]) / seeds <= bar and lies == 0
 
 
 def search(kind: str, seeds: Sequence[int], upright: bool) -> bool:
@@ -382,6 +426,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=0, help="seed, of --part search")
     parser.add_argument("--upright", action="store_true", help="people stand, of --part search")
+    parser.add_argument("--clothed", action="store_true", help="people in shirt and trousers, with a start")
+    parser.add_argument("--whole", action="store_true", help="scans of all sides, of --clothed")
+    parser.add_argument("--points", type=int, default=NUM_POINTS, help="of --clothed")
     parser.add_argument("--scans", type=int, default=5, help="of one person, with --part shared")
     parser.add_argument("--rivals", type=int, default=0, help="seeds that the rivals get too")
     parser.add_argument("--data", type=Path, help="folder with rigs/*.glb, of --part bones")
@@ -394,6 +441,8 @@ def main() -> int:
     if find_spec("anny") is None:
         print("skipped: anny is not installed; pip install 'torchreg-articulated[anny]'")
         return 0
+    if options.clothed:
+        return 0 if clothed(options.seeds, options.points, whole=options.whole) else 1
     if options.part == "growth":
         return 0 if growth() else 1
     if options.part == "search":

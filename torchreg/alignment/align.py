@@ -22,6 +22,7 @@ from torchreg.alignment.search.in_picture import not_found_if_improbable, surest
 from torchreg.alignment.search.landmark_fit import KeypointRows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.shape.clothing import may_be_clothed
 from torchreg.alignment.shape.person_rows import PersonRows
 from torchreg.alignment.shape.shape_fit import fitted_rig
 from torchreg.capture.depth_frame import DepthFrame
@@ -45,6 +46,7 @@ def align(
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,
     fit_shape: bool | str = False,
+    clothed: bool | str = "auto",
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
     initializer: PoseProposer | HoldsProposer | None = None,
@@ -80,6 +82,8 @@ def align(
             any rig, whose coefficients are then the lengths and radii of its parts. For one cloud or depth frame
             without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients. Without
             one, people of different sizes are sought everywhere.
+        clothed: of a body of anny whose shape is fitted, whether clothes lie between its skin and the data, see
+            `AlignResult.clothing_offset`; by default where the data are likelier with clothes. Others wear none.
         keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
             beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
@@ -112,7 +116,7 @@ def align(
     """
     config = config or AlignConfig()
     source = StartSource.of(shape, initializer=initializer, upright=config.upright)
-    known = KnownDofs.of(shape, locked, prior)
+    known, clothed = KnownDofs.of(shape, locked, prior), may_be_clothed(shape, clothed, fit_shape)
     if fit_shape is not False:
         if initializer is not None:
             raise InputError("initializer has no meaning with fit_shape; people are sought without one")
@@ -120,7 +124,7 @@ def align(
     start = shape.pose_from_dict(initial_pose) if isinstance(initial_pose, Mapping) else initial_pose
     task = Task(
         shape=shape, source=source, config=config, model_points=model_points, known=known, start=start,
-        fit_shape=fit_shape is not False, on_step=on_step,
+        fit_shape=fit_shape is not False, clothed=clothed, on_step=on_step,
     )  # fmt: skip
     options: dict[str, Any] = {"keypoints": keypoints, "keypoint_std": keypoint_std}
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:

@@ -147,6 +147,7 @@ class Task:
     known: KnownDofs | None = None
     start: Tensor | None = None
     fit_shape: bool = False
+    clothed: bool | str = False
     on_step: OnStep | None = None
     seen: Observation = Observation(None, None)
 

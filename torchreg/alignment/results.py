@@ -72,6 +72,8 @@ class AlignResult(Result):
         coefficients: (C,) of the shape, where they were fitted too; the distances and all else are those of
             ``shape.with_coefficients(coefficients)``. None where the shape was taken as it was.
         coefficient_covariance: (C, C) of them.
+        clothing_offset: (V,) how far clothes lie off the skin at each vertex of the body, metres; `distances` are then
+            those to the clothes. None where it wears none that are seen.
         shape: that was aligned; where coefficients were fitted, the rig of that person. A file keeps it
             without its mesh where that takes more than 4 MB.
         up: the upright direction, where it is known, as from a file's format; pictures else guess it from the points.
@@ -86,6 +88,7 @@ class AlignResult(Result):
         "pose": "D", "registered": "N 3", "keypoints": "K 3", "distances": "M", "inliers": "M", "posterior": "M",
         "sigma": "", "cost": "", "covariance": "D D", "confidence": "", "evidence": "E", "crop": "H W",
         "coefficients": "C", "coefficient_covariance": "C C", "dof_confidence": "D", "rivals": "R D",
+        "clothing_offset": "V",
     }  # fmt: skip
 
     pose: Tensor
@@ -110,6 +113,7 @@ class AlignResult(Result):
     up: tuple[float, float, float] | None = None
     dof_confidence: Tensor | None = None
     rivals: Tensor | None = None
+    clothing_offset: Tensor | None = None
 
     @property
     def named_pose(self) -> dict[str, Any]:

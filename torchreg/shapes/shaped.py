@@ -7,6 +7,7 @@ the positions of its frame at rest and in the pose.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -142,9 +143,9 @@ class ShapedSkin(nn.Module):
         return len(self.weights)
 
     @property
-    def basis(self) -> Tensor:
-        """The matrix (N, N) that takes points, as rows, to points."""
-        return torch.eye(len(self), dtype=self.weights.dtype, device=self.weights.device)
+    def basis(self) -> None:
+        """None: rows are the points themselves."""
+        return None
 
     def vertex_index(self, index: Tensor) -> Tensor:
         """Return the vertices (M, C) of the rig between which some points (M,) lie."""
@@ -176,29 +177,41 @@ class ShapedSkin(nn.Module):
         """Return the rows, points then normals (B, 2 N, 3), and the points' derivatives (B, N, 3, D + K)."""
         posed = self.shape.posed(state, self.space)
         points, blend = self._placed(posed)
-        linear, angular, by_part = self._motions(posed)
+        every = torch.arange(len(self), device=points.device)
+        linear, angular, by_part = self._motions(posed, every)
         moments = torch.einsum("...pcn,pk->...nkc", by_part, self.shape.part_moves)
         turned = torch.linalg.cross(angular.unsqueeze(-3).expand_as(moments), moments)
         by_pose = self._coupled((linear.unsqueeze(-3) * self.subtree.unsqueeze(-1) + turned).mT)
         rows = torch.cat([points, self._normals(posed, blend)], dim=-2)
-        return rows, torch.cat([by_pose, self._by_coefficients(posed, blend)], dim=-1)
+        return rows, torch.cat([by_pose, self._by_coefficients(posed, blend, every)], dim=-1)
 
     def normal_jacobian(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return points and normals (B, N, 3), and the derivatives (B, N, D + K) of the points along their normals."""
+        points, normals, jacobian_of = self.lazy_normal_jacobian(state)
+        return points, normals, jacobian_of(torch.arange(len(self), device=points.device))
+
+    def lazy_normal_jacobian(self, state: Tensor) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
+        """Return points and normals (B, N, 3), and what takes an index (M,) to the derivatives (B, M, D + K)."""
         posed = self.shape.posed(state, self.space)
         points, blend = self._placed(posed)
         normals = self._normals(posed, blend)
-        linear, angular, by_part = self._motions(posed)
-        # n . (angular x m) = angular . (m x n), summed over the parts that each degree of freedom moves.
-        levers = torch.linalg.cross(by_part, normals.mT.unsqueeze(-3).expand_as(by_part), dim=-2)
-        turning = (self.shape.part_moves.unsqueeze(-2) * angular.mT.unsqueeze(-3)).flatten(-3, -2)
-        by_pose = (normals @ linear.mT) * self.subtree + levers.flatten(-3, -2).mT @ turning
-        by_coefficients = (normals.unsqueeze(-2) @ self._by_coefficients(posed, blend)).squeeze(-2)
-        return points, normals, torch.cat([self._coupled(by_pose), by_coefficients], dim=-1)
 
-    def _between(self, vertices: Tensor) -> Tensor:
-        """Return what vertices (..., U, 3) give at the points, (..., N, 3)."""
-        return (vertices[..., self.corners, :] * self.shares.unsqueeze(-1)).sum(-2)
+        def along(index: Tensor) -> Tensor:
+            normal = normals[..., index, :]
+            linear, angular, by_part = self._motions(posed, index)
+            # n . (angular x m) = angular . (m x n), summed over the parts that each degree of freedom moves.
+            levers = torch.linalg.cross(by_part, normal.mT.unsqueeze(-3).expand_as(by_part), dim=-2)
+            turning = (self.shape.part_moves.unsqueeze(-2) * angular.mT.unsqueeze(-3)).flatten(-3, -2)
+            by_pose = (normal @ linear.mT) * self.subtree[index] + levers.flatten(-3, -2).mT @ turning
+            by_coefficients = (normal.unsqueeze(-2) @ self._by_coefficients(posed, blend, index)).squeeze(-2)
+            return torch.cat([self._coupled(by_pose), by_coefficients], dim=-1)
+
+        return points, normals, along
+
+    def _between(self, vertices: Tensor, index: Tensor | None = None) -> Tensor:
+        """Return what vertices (..., U, 3) give at the points, or some of them, (..., N, 3)."""
+        corners, shares = (self.corners, self.shares) if index is None else (self.corners[index], self.shares[index])
+        return (vertices[..., corners, :] * shares.unsqueeze(-1)).sum(-2)
 
     def _placed(self, posed: _Posed) -> tuple[Tensor, Tensor]:
         """Return the points (..., N, 3) and the blended turns (..., N, 3, 3)."""
@@ -211,22 +224,23 @@ class ShapedSkin(nn.Module):
         rest = torch.linalg.cross(across, along).unsqueeze(-1)
         return nn.functional.normalize((blend @ rest).squeeze(-1), dim=-1)
 
-    def _motions(self, posed: _Posed) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the twists (..., 6 + J, 3) of the pose, and the points by part (..., P, 3, N), times their weights."""
+    def _motions(self, posed: _Posed, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return twists (..., 6 + J, 3) of the pose, and some points by part (..., P, 3, M), times their weights."""
         linear, angular = self.shape.rig.frame_twists(posed.pose, posed.frames, "tangent")
-        rest = self._between(posed.vertices).mT
+        rest = self._between(posed.vertices, index).mT
         by_part = (posed.turns.flatten(-3, -2) @ rest).unflatten(-2, (-1, 3)) + posed.offsets.unsqueeze(-1)
-        return linear, angular, by_part * self.weights.mT.unsqueeze(-2)
+        return linear, angular, by_part * self.weights[index].mT.unsqueeze(-2)
 
     def _coupled(self, by_joint: Tensor) -> Tensor:
         rig = self.shape.rig
         return by_joint @ rig.couplings() if rig.kinematics.has_mimics else by_joint
 
-    def _by_coefficients(self, posed: _Posed, blend: Tensor) -> Tensor:
-        """Return the derivatives (B, N, 3, K) of the points by the coefficients."""
+    def _by_coefficients(self, posed: _Posed, blend: Tensor, index: Tensor) -> Tensor:
+        """Return the derivatives (B, M, 3, K) of some points by the coefficients."""
         by_vertex, by_frame = self.space.rest_jacobian(posed.coefficients)
-        rest = (by_vertex[..., self.corners, :, :] * self.shares[..., None, None]).sum(-3)
-        index = self.shape.rig.part_index
-        shifts = self.shape.shifts(posed.above, by_frame).index_select(-3, index)
-        offsets = shifts - posed.turns @ by_frame.index_select(-3, index)
-        return blend @ rest + (self.weights @ offsets.flatten(-2)).unflatten(-1, offsets.shape[-2:])
+        rest = (by_vertex[..., self.corners[index], :, :] * self.shares[index][..., None, None]).sum(-3)
+        carriers = self.shape.rig.part_index
+        shifts = self.shape.shifts(posed.above, by_frame).index_select(-3, carriers)
+        offsets = shifts - posed.turns @ by_frame.index_select(-3, carriers)
+        moved = (self.weights[index] @ offsets.flatten(-2)).unflatten(-1, offsets.shape[-2:])
+        return blend[..., index, :, :] @ rest + moved

@@ -38,9 +38,12 @@ class ShapedSurface(SkinSurface):
 
     def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances (B, M) and their Jacobian (B, M, D + K) in tangent coordinates."""
-        posed, normals, jacobian = self.shaped.normal_jacobian(pose)
+        posed, normals, jacobian_of = self.shaped.lazy_normal_jacobian(pose)
         distance, nearest = self._oriented_distance(points, posed, normals)
-        return distance, -jacobian.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, jacobian.shape[-1]))
+        # Of a scan from one side half of the samples are nearest to no datum.
+        used, index = nearest.unique(return_inverse=True)
+        jacobian = jacobian_of(used)
+        return distance, -jacobian.gather(-2, index.unsqueeze(-1).expand(*index.shape, jacobian.shape[-1]))
 
     def _oriented_distance(self, points: Tensor, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         distance, nearest, normal = self._plane_distance(points, posed, normals)

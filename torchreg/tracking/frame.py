@@ -110,7 +110,7 @@ class FrameFit:
         jacobian: (1, M, num_dofs) of the distances.
         transforms: (P, 4, 4) of the parts.
         residual: () robust standard deviation of the distances near the surface, metres.
-        change: largest change of the pose in the last step.
+        last_step: (1, num_dofs) of the fit, in tangent coordinates.
         cost: soft count of outliers and the prior, by which fits to a frame are ranked.
         intruding: data that points in free space stand for, see `free_space_loss`.
         num_inliers: number of data near the surface.
@@ -127,7 +127,7 @@ class FrameFit:
     jacobian: Tensor
     transforms: Tensor
     residual: Tensor
-    change: float
+    last_step: Tensor
     cost: float
     intruding: Tensor
     num_inliers: int

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends, near_outlier_share
 from torchreg.alignment.evidence.curvature import hardly_gains
-from torchreg.alignment.evidence.reliability import Evidence, weigh
+from torchreg.alignment.evidence.reliability import Evidence, SurfaceError, weigh
 from torchreg.alignment.fit.annealed_em import anneal
 from torchreg.alignment.fit.factors import Factor
 from torchreg.alignment.fit.free_space_term import INTRUSION, FreeSpaceTerm
@@ -186,8 +186,11 @@ class FrameFitter:
         covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
-    def judged(self, fit: FrameFit, covariance: Tensor) -> tuple[Evidence, bool]:
-        """Return the evidence for a fit with a covariance (num_dofs, num_dofs), and whether it has converged."""
+    def judged(self, fit: FrameFit, covariance: Tensor, error: SurfaceError | None = None) -> tuple[Evidence, bool]:
+        """Return the evidence for a fit with a covariance (num_dofs, num_dofs), and whether it has converged.
+
+        Where coefficients are fitted too, both rest on the errors of the surface, as in `align`.
+        """
         problem, pose = fit.view.problem, fit.pose
         moves = end_motions(self.skin, pose, self._ends)
         evidence = weigh(
@@ -196,7 +199,9 @@ class FrameFitter:
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
             intruding=fit.intruding,
         )  # fmt: skip
-        converged = fit.change <= problem.pose_atol or hardly_gains(
+        if error is not None:
+            return replace(evidence, unknown=error.unknown(self.size)), bool(error.converged)
+        converged = float(problem.change(fit.last_step)) <= problem.pose_atol or hardly_gains(
             problem, pose, fit.distance, fit.jacobian, fit.residual[None], covariance[None]
         )
         return evidence, bool(converged)
@@ -213,7 +218,7 @@ class FrameFitter:
         wide_prior = GaussianPosePrior(problem.prior.mean, self._joint_precision(FILTER.max_joint_std))
         return FrameFit(
             view=view, pose=pose, distance=distance, jacobian=fitted.jacobian, transforms=transforms,
-            residual=residual, change=float(fitted.change),
+            residual=residual, last_step=fitted.last_step,
             cost=float(alignment_cost(replace(problem, prior=wide_prior), pose, distance)),
             intruding=intruding, num_inliers=int((distance.abs() < self.inlier_distance).sum()),
             unexplained=unexplained, num_new_unexplained=self.clusters.count_new(state, unexplained, transforms[0]),

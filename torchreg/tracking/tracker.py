@@ -15,6 +15,7 @@ from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_ab
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.landmarks import MeasuredKeypoints
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
@@ -411,7 +412,8 @@ class Tracker:
         if fit is None:
             return self._hold(state, frame, Status.LOST)
         covariance, observed = self._fitter.covariance(fit)
-        result = fitted_result(self._fitter, state, frame, fit, covariance)
+        error = None if self._person is None else _surface_error(self._person, state, frame, fit)
+        result = fitted_result(self._fitter, state, frame, fit, covariance, error)
         after = self._state_after(state, frame, fit, observed)
         return result, replace(after, sure=after.sure or result.statuses[0].usable)
 
@@ -443,11 +445,29 @@ class Tracker:
         return predicted_result(self._fitter, state, frame, pose, status), after
 
 
+def _surface_error(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> SurfaceError | None:
+    """Return the errors of a person's surface in a fit to a frame; None where no coefficients are known."""
+    known = _known_person(state)
+    if known is None:
+        return None
+    return person.surface_error(known, fit.view.problem.data[0], fit.pose[0], fit.last_step[0], _viewpoint(frame, fit))
+
+
 def _learned(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> TrackState:
     """Return the state with what a fit to a frame tells of the coefficients."""
-    if state.coefficients is None or state.coefficient_covariance is None:
+    known = _known_person(state)
+    if known is None:
         return state
-    known = KnownPerson(state.coefficients, state.coefficient_covariance)
-    viewpoint = None if frame.picture is None else frame.picture.camera.position - fit.view.origin
-    known = person.update(known, fit.view.problem.data[0], fit.pose[0], viewpoint)
+    known = person.update(known, fit.view.problem.data[0], fit.pose[0], _viewpoint(frame, fit))
     return replace(state, coefficients=known.coefficients, coefficient_covariance=known.covariance)
+
+
+def _known_person(state: TrackState) -> KnownPerson | None:
+    if state.coefficients is None or state.coefficient_covariance is None:
+        return None
+    return KnownPerson(state.coefficients, state.coefficient_covariance)
+
+
+def _viewpoint(frame: Frame, fit: FrameFit) -> Tensor | None:
+    """Return where a picture was taken (3,), in the coordinates of a fit's view."""
+    return None if frame.picture is None else frame.picture.camera.position - fit.view.origin

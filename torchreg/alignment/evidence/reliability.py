@@ -10,12 +10,14 @@ from itertools import takewhile
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torchreg.alignment.evidence.clusters import OFF_SURFACE, clusters_beside
 from torchreg.alignment.evidence.confidence import (
     EVIDENCE,
     SurfaceResiduals,
     end_spreads,
+    end_variances,
     limb_points,
     near_outlier_share,
 )
@@ -29,6 +31,7 @@ from torchreg.capture.depth_segments import beyond_cut
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.shaped import ShapedSkin
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +113,25 @@ class SurfaceError:
     parts: Tensor
     moved: Tensor
 
+    @classmethod
+    def of(cls, skin: ShapedSkin, moves: Tensor, covariance: Tensor, moved: Tensor) -> SurfaceError:
+        """Return the errors of a skin with derivatives (B, N, 3, D) in states with covariances (B, D, D)."""
+        variances = end_variances(moves, covariance)
+        owned = one_hot(skin.weights.argmax(-1), skin.weights.shape[1]).to(variances)
+        by_part = variances @ owned / owned.sum(0).clamp_min(1)
+        return cls(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
+
     @property
     def converged(self) -> Tensor:
         """Whether the last step moved the surface by no more than is not known of it, (B,)."""
         return self.moved <= self.whole
 
     def unknown(self, size: float) -> Tensor:
-        """Return the evidence (B,) that the data do not tell where the surface is, from 0 to 1."""
-        return (-(_SCALES.surface_error * size / self.whole).square()).exp()
+        """Return the evidence (B,) that the surface is not where it was fitted, from 0 to 1.
+
+        Data do not tell where it is, or the fit stopped while it was moving.
+        """
+        return (-(_SCALES.surface_error * size / torch.hypot(self.whole, self.moved)).square()).exp()
 
     def loose(self, limbs: Sequence[Limb], size: float) -> Tensor:
         """Return of which limbs the data leave open where they are, (B, L)."""

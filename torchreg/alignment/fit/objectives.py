@@ -105,14 +105,14 @@ class Objective:
 class SoftMatches:
     """Eq. 20, ``sum_i lambda_i |T(X_i, pose) - G_i|^2 / 2 sigma^2``, over the model points only.
 
-    The skin is linear in the part transforms, so the curvature over all points collapses into one small matrix.
+    A skin that is linear in the part transforms has the curvature of all points in one small matrix.
     """
 
     def __init__(self, skin: LinearBlendSkin, matches: EStep, sigma: Tensor) -> None:
         self.skin, self.targets = skin, matches.targets
         weights = torch.threshold(matches.weights, 1e-12, 0.0)
         self.weights = (weights / (sigma * sigma).unsqueeze(-1)).unsqueeze(-1)
-        self.curvature = skin.basis.mT @ (self.weights * skin.basis)
+        self.curvature = None if skin.basis is None else skin.basis.mT @ (self.weights * skin.basis)
 
     def residuals(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Return the part transforms of poses (B, num_dofs) and their derivatives, see `transform_jacobian`."""
@@ -123,10 +123,13 @@ class SoftMatches:
         residual = self.skin.place(rows) - self.targets
         weighted = self.weights * residual
         flat = derivative.flatten(-3, -2)
-        # Written with the three coordinates from the left, as in `place`.
-        by_transform = (weighted.mT @ self.skin.basis).mT.flatten(-2).unsqueeze(-1)
-        gradient = (flat.mT @ by_transform).squeeze(-1)
-        curved = (self.curvature @ derivative.flatten(-2)).reshape(flat.shape)
+        if self.curvature is None:
+            by_row, curved = weighted, self.weights.unsqueeze(-1) * derivative
+        else:
+            # Written with the three coordinates from the left, as in `place`.
+            by_row, curved = (weighted.mT @ self.skin.basis).mT, self.curvature @ derivative.flatten(-2)
+        gradient = (flat.mT @ by_row.flatten(-2).unsqueeze(-1)).squeeze(-1)
+        curved = curved.reshape(flat.shape)
         return Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
 
     def cost(self, pose: Tensor) -> Tensor:

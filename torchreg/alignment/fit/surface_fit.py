@@ -75,12 +75,12 @@ def fit_surface(
 
 @dataclass(frozen=True)
 class SurfaceResult:
-    """Poses (B, num_dofs) after steps on the surface, distances (B, M), their Jacobian, and the last change (B,)."""
+    """Poses (B, num_dofs) after steps on the surface, distances (B, M), their Jacobian, and the last step."""
 
     pose: Tensor
     distance: Tensor
     jacobian: Tensor
-    change: Tensor
+    last_step: Tensor
 
 
 def refine_surface(problem: AlignProblem, pose: Tensor, *, steps: int, widths: Sequence[float]) -> SurfaceResult:
@@ -96,8 +96,7 @@ def refine_surface(problem: AlignProblem, pose: Tensor, *, steps: int, widths: S
         solved = problem.step(around, pose, SURFACE_FIT.refine_damping)
         pose = solved.state
         distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
-    change = problem.change(solved.last_step)
-    return SurfaceResult(pose=pose, distance=distance, jacobian=jacobian, change=change)
+    return SurfaceResult(pose=pose, distance=distance, jacobian=jacobian, last_step=solved.last_step)
 
 
 def surface_steps(problem: AlignProblem, pose: Tensor, sigma: Tensor, noise: Tensor, steps: int) -> LMResult:

@@ -10,9 +10,11 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.problem import joint_precision, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
-from torchreg.alignment.shape.shape_fit import fitted_rig, plausible_precision, robust_rows, scan_normals, surface_skins
+from torchreg.alignment.shape.person_covariance import plausible_precision, robust_rows
+from torchreg.alignment.shape.shape_fit import fitted_rig, scan_normals, surface_skins
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.upright import Direction
 from torchreg.result import Status
@@ -59,7 +61,7 @@ class PersonFilter:
 
     def initialize(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
         """Return the pose (num_dofs,) and coefficients of a first frame; None where the shape is not found."""
-        found = align(self.rig, data, start, fit_shape=True, config=self._config)
+        found = align(self.rig, data, start, fit_shape=True, clothed=False, config=self._config)
         mean, covariance = found.coefficients, found.coefficient_covariance
         shows = found.statuses[0] in (Status.CONVERGED, Status.MAX_STEPS, Status.DOUBTFUL)
         if not shows or mean is None or covariance is None:
@@ -91,6 +93,25 @@ class PersonFilter:
         alone = hessian + pad(self._precision, (0, len(information))).diag()
         covariance = torch.linalg.inv(information + shared_information(alone, dofs))
         return KnownPerson(state[0, dofs:], covariance.to(person.covariance))
+
+    def surface_error(
+        self, person: KnownPerson, data: Tensor, pose: Tensor, last_step: Tensor, viewpoint: Tensor | None = None
+    ) -> SurfaceError:
+        """Return the standard errors of the surface in a frame (M, 3), with the last step of its fit.
+
+        They are those of pose and coefficients together, of which the frames before know the latter.
+        """
+        dofs, valid = self.rig.num_dofs, torch.ones_like(data[:, 0], dtype=torch.bool)
+        surface = ShapedSurface(
+            self._skin, scan_normals(data, valid, viewpoint)[None], SURFACE_FIT.max_width * self._size
+        )
+        state = torch.cat([pose, person.coefficients.to(pose)])[None]
+        hessian, _ = self._normal_equations(surface, data, valid, state)
+        known = torch.block_diag(self._precision.diag(), torch.linalg.inv(person.covariance.double()))
+        covariance = torch.linalg.inv(hessian + known)[None].to(pose)
+        _, moves = self._skin.row_jacobian(state)
+        moved = (moves[..., :dofs] @ last_step).square().sum(-1).mean(-1).sqrt()
+        return SurfaceError.of(self._skin, moves, covariance, moved)
 
     def differs(self, first: Tensor, second: Tensor) -> bool:
         """Return whether two people with coefficients (K,) differ, at rest, by more than a model is exact."""

@@ -54,7 +54,7 @@ def person_with_gradients(
         surface, data = problem.surface, problem.data.clone()
         distance, nearest = surface.nearest(data, state.clone())
         noise = surface_noise(distance, problem.valid, problem.size)
-        tree = ShapedTree(shape, shape.coefficient_space())
+        tree = ShapedTree(fitted.rig, fitted.rig.coefficient_space())
         dense = surface.shaped
         index = nearest[0]
         planes = PairedPlanes(ShapedSkin(tree, dense.vertex_index(index), dense.shares[index], dense.weights[index]))
@@ -70,4 +70,4 @@ def person_with_gradients(
     exact = fixed.newton_steps(state.clone(), centered, start, _EXACTNESS.steps)
     found = (state.clone() + (attach_gradients(fixed, exact, centered, start) - exact))[0]
     pose, coefficients = found.tensor_split([shape.num_dofs])
-    return torch.cat([pose[:3] + origin[0], pose[3:]]), coefficients
+    return torch.cat([pose[:3] + origin[0], pose[3:]]), coefficients[: len(fitted.coefficients)]

@@ -18,6 +18,9 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.pose_rows import PoseRows
 from torchreg.alignment.results import AlignRecord, AlignResult
+from torchreg.alignment.shape.clothing import ClothedSpace, clothed_rig
+from torchreg.alignment.shape.clothing_evidence import bare_where_likelier
+from torchreg.alignment.shape.person_covariance import noise_covariance, shared_covariance
 from torchreg.alignment.shape.person_gradient import person_with_gradients
 from torchreg.alignment.shape.person_search import lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_fit import (
@@ -25,8 +28,6 @@ from torchreg.alignment.shape.shape_fit import (
     FittedShape,
     fitted_shape,
     shape_problem,
-    shared_covariance,
-    state_covariance,
 )
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 from torchreg.errors import InputError
@@ -63,6 +64,9 @@ class PersonRows:
             if clouds.ndim != 2:
                 raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
         poses = None if task.start is None else task.starts(clouds[None], task.start)
+        if task.clothed:
+            with torch.no_grad():
+                task = replace(task, shape=clothed_rig(shape, surely=task.clothed is True))
         return cls.of_scans(replace(task, seen=seen), clouds[None], valid[None], poses)
 
     @classmethod
@@ -117,9 +121,14 @@ class PersonRows:
         if alike is not None:
             fine, state = self._learned_spread(fine, state, alike)
             problem = replace(problem, prior=replace(problem.prior, precision=fine.prior.precision))
-        before = self._fit(problem, state, SHAPE_FIT.fine_steps, SURFACE_FIT.widths[-1:]).pose
+        space = self.task.shape.coefficient_space()
+        if isinstance(space, ClothedSpace) and not space.surely:
+            count = len(space) - len(space.body)
+            fine, state = bare_where_likelier(fine, state, count, self._fitted_closely, noise_covariance)
+            problem = replace(problem, prior=fine.prior)
+        before = self._fitted_closely(problem, state)
         last = replace(self._fit(problem, before, 1, SURFACE_FIT.widths[-1:]), sigma=self.sigma)
-        fitted = fitted_shape(problem, before, last, self.task.shape.num_dofs)
+        fitted = fitted_shape(problem, before, last, self.task.shape)
         return FoundPerson(self.task, replace(fitted, lead=self.lead), self.history)
 
     @property
@@ -140,6 +149,10 @@ class PersonRows:
         self, problem: ShapeProblem, state: Tensor, steps: int, widths: Sequence[float] = SURFACE_FIT.widths
     ) -> StageResult:
         return fit_surface(problem, state, steps=steps, widths=widths, on_step=self.record)
+
+    def _fitted_closely(self, problem: ShapeProblem, state: Tensor) -> Tensor:
+        """Return states (B, D + K) fitted from nearly right ones."""
+        return self._fit(problem, state, SHAPE_FIT.fine_steps, SURFACE_FIT.widths[-1:]).pose
 
     def _descended(self, problem: ShapeProblem, state: Tensor, widths: SigmaSchedule) -> Tensor:
         """Return states (B, D + K) after an annealed EM and a coarse fit to the surface."""
@@ -177,14 +190,14 @@ class PersonRows:
         group = member.to(state)
         for _ in range(SHAPE_FIT.spread_steps):
             precision = problem.prior.precision[dofs:] * problem.scans
-            covariance = shared_covariance(state_covariance(problem, state), dofs)
+            covariance = shared_covariance(noise_covariance(problem, state), dofs)
             told = (1 - covariance.diagonal() * precision).clamp(0, 1)
             squares = (state[0, dofs:] - space.mean).square() @ group + (space.std.square() @ group) / group.sum(0)
             variance = squares / (told @ group + 1)
             learned = torch.where(member.any(-1), (group @ variance.reciprocal()), precision) / problem.scans
             joined = torch.cat([problem.prior.precision[:dofs], learned])
             problem = replace(problem, prior=replace(problem.prior, precision=joined))
-            state = self._fit(problem, state, SHAPE_FIT.fine_steps, SURFACE_FIT.widths[-1:]).pose
+            state = self._fitted_closely(problem, state)
         return problem, state
 
 
@@ -200,7 +213,7 @@ class FoundPerson:
         """Return the alignment of the person found, with gradients where the data have them."""
         task, fitted, shape, points = self.task, self.fitted, self.task.shape, self.task.seen.points
         dofs, coefficients = shape.num_dofs, fitted.coefficients
-        person = replace(task, shape=shape.with_coefficients(coefficients), model_points=None)
+        person = replace(task, shape=fitted.person, model_points=None)
         clouds, valid = check_clouds(shape, points, task.seen.mask, task.config.nan_policy)
         rows = PoseRows.centered(person, person.skin(), clouds, valid, fitted.poses)
         found = StageResult(pose=rows.start, sigma=fitted.sigma, change=fitted.change)
@@ -212,6 +225,7 @@ class FoundPerson:
             covariance=covariance,
             dof_confidence=dof_confidence(shape, covariance, rows.problem.size),
             coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
+            clothing_offset=fitted.clothing,
         ))  # fmt: skip
         if not (isinstance(points, Tensor) and points.requires_grad):
             return result

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchreg.alignment.evidence.confidence import end_variances
-from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.annealed_em import StageResult
 from torchreg.alignment.fit.objectives import GaussianPosePrior
-from torchreg.alignment.fit.problem import BROAD_PRIOR, joint_precision, masked_mean, model_size
-from torchreg.alignment.fit.surface_fit import SURFACE_FIT, pose_covariance, surface_noise
+from torchreg.alignment.fit.problem import joint_precision, masked_mean, model_size
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT
+from torchreg.alignment.shape.clothing import ClothedSpace
+from torchreg.alignment.shape.person_covariance import noise_covariance, with_errors_of_parts
 from torchreg.alignment.shape.person_search import find_people
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 from torchreg.errors import InputError
@@ -25,12 +25,10 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
 from torchreg.shapes.spec import RigSurface
-from torchreg.solvers.robust import welsch_weight
 
 if TYPE_CHECKING:
     from torchreg.alignment.config import AlignConfig
@@ -65,7 +63,8 @@ class FittedShape:
     """Poses (T, D) and coefficients (K,) of a fit, with covariances (T, D + K, D + K) in tangent coordinates.
 
     `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
-    state is worse in a search.
+    state is worse in a search. `rig` has those of clothes as its last coefficients, where there may be any, of which
+    those lie off the skin by `clothing` (V,), metres.
     """
 
     poses: Tensor
@@ -77,7 +76,14 @@ class FittedShape:
     error: SurfaceError
     problem: ShapeProblem
     state: Tensor
+    rig: ArticulatedShape
+    clothing: Tensor | None = None
     lead: Tensor | None = None
+
+    @property
+    def person(self) -> ArticulatedShape:
+        """The rig of the person, whose surface is that of the clothes."""
+        return self.rig.with_coefficients(self.state[0, self.rig.num_dofs :].clone())
 
 
 def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = True) -> ArticulatedShape:
@@ -93,26 +99,27 @@ def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = 
     return shape
 
 
-def shared_covariance(covariance: Tensor, num_dofs: int) -> Tensor:
-    """Return the covariance (K, K) of coefficients from scans' (T, D + K, D + K), each with its prior's share."""
-    alone = covariance[:, num_dofs:, num_dofs:].double()
-    return torch.linalg.inv(torch.linalg.inv(alone).sum(0)).to(covariance)
-
-
-def fitted_shape(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs: int) -> FittedShape:
+def fitted_shape(problem: ShapeProblem, before: Tensor, found: StageResult, shape: ArticulatedShape) -> FittedShape:
     """Return the end of a fit, whose last step began in states (T, D + K)."""
-    poses, coefficients = found.pose.tensor_split([num_dofs], dim=-1)
-    covariance = state_covariance(problem, found.pose)
+    poses, coefficients = found.pose.tensor_split([shape.num_dofs], dim=-1)
+    space, clothing = shape.coefficient_space(), None
+    body = space.body if isinstance(space, ClothedSpace) else space
+    if isinstance(space, ClothedSpace) and bool((problem.prior.mean[0, shape.num_dofs + len(body) :] != 0).any()):
+        clothing = space.clothing_offset(coefficients[0])
+    known = shape.num_dofs + len(body)
+    covariance = noise_covariance(problem, found.pose)
     return FittedShape(
-        poses=poses + pad(problem.origin, (0, num_dofs - 3)),
-        coefficients=coefficients[0],
-        covariance=covariance,
+        poses=poses + pad(problem.origin, (0, shape.num_dofs - 3)),
+        coefficients=coefficients[0, : len(body)],
+        covariance=with_errors_of_parts(problem, found.pose, covariance)[:, :known, :known],
         cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
-        error=_surface_error(problem, before, found.pose, covariance),
+        error=_surface_error(problem, before, found.pose, covariance[:, :known, :known]),
         problem=problem,
         state=found.pose,
+        rig=shape,
+        clothing=clothing,
     )
 
 
@@ -120,45 +127,7 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
     """Return the standard errors of the surface in states (T, D + K), by their covariance, and their last step."""
     rows, moves = problem.skin.row_jacobian(state)
     moved = (problem.skin.place(rows) - problem.skin(before)).square().sum(-1).mean(-1).sqrt()
-    variances = end_variances(moves, covariance)
-    owned = torch.nn.functional.one_hot(problem.skin.weights.argmax(-1), problem.skin.weights.shape[1]).to(variances)
-    by_part = variances @ owned / owned.sum(0).clamp_min(1)
-    return SurfaceError(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
-
-
-def state_covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
-    """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
-    rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
-    precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
-    return pose_covariance(rows.jacobian, rows.weights, rows.noise, precision.expand_as(state))
-
-
-@dataclass(frozen=True)
-class RobustRows:
-    """Distances (B, M) in metres, Jacobian (B, M, D + K) and Welsch weights of data as rows of a least-squares problem.
-
-    `noise` (B,) is the deviation of each datum as if all were independent: larger where neighbors err together.
-    """
-
-    distance: Tensor
-    jacobian: Tensor
-    weights: Tensor
-    noise: Tensor
-
-
-def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor, size: float) -> RobustRows:
-    """Return data (B, M, 3) as rows of a least-squares problem in states (B, D + K) of poses and coefficients."""
-    distance, jacobian = surface.distance_jacobian(data, state)
-    noise = surface_noise(distance, valid, size)
-    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * valid
-    shared = correlated_count(neighbor_correlation(data, distance, near))
-    return RobustRows(distance, jacobian=jacobian, weights=near, noise=noise * shared.clamp_min(1).sqrt())
-
-
-def plausible_precision(rig: Articulation, size: float, precision: Tensor) -> Tensor:
-    """Return the precision (D + K,) of a prior, of the pose at least that of any plausible one."""
-    broad = BROAD_PRIOR.precision(rig, size)
-    return torch.maximum(precision, pad(broad, (0, precision.shape[-1] - rig.num_dofs)))
+    return SurfaceError.of(problem.skin, moves[..., : covariance.shape[-1]], covariance, moved)
 
 
 def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
@@ -189,7 +158,8 @@ def shape_problem(
         problem, start = shape_problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
         return _found(problem, shape, start[:, shape.num_dofs :], generator, config.upright)
     space, surface = shape.coefficient_space(), shape.file_surface()
-    people = different_people(space, generator)
+    people = different_people(space.body if isinstance(space, ClothedSpace) else space, generator)
+    people = torch.cat([people, space.mean[people.shape[-1] :].expand(len(people), -1)], dim=-1)
     tree = ShapedTree(shape, space)
     normals = torch.stack([
         scan_normals(points, told, None if viewpoints is None else viewpoints[number])
