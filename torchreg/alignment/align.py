@@ -79,6 +79,7 @@ def align(
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
     initializer: PoseProposer | HoldsProposer | None = None,
+    support: str = "auto",
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
@@ -117,6 +118,8 @@ def align(
         keypoint_std: their standard deviation, () or (K,), in metres or pixels; by default 3 % of the shape's size, or
             5 pixels. Beyond three of them a keypoint is taken for wrong.
         initializer: a network that proposes poses where there is no start, see `find_pose`; the built-in hand has one.
+        support: of clouds: "auto" leaves out the table or floor that a scanned thing stands on, see `split_support`, as
+            if masked; not where the shape has a flat foot itself. "keep" takes all points for what was given.
         config: see `AlignConfig`.
         on_step: called with an `AlignRecord` after each iteration.
 
@@ -130,6 +133,7 @@ def align(
 
     Warns:
         DegenerateDataWarning: if the inliers lie at one place, on a line or on a plane; the status is DEGENERATE.
+        FileWarning: if a support is left out.
         UnitsWarning: if the data are more than thirty times larger or smaller than the shape.
 
     Differentiable: with ``fit_shape``, ``pose`` and ``coefficients`` once in ``data``, by the implicit function; which
@@ -163,7 +167,7 @@ def align(
             partial(source.crop_score, skin),
         )  # fmt: skip
         return replace(not_found_if_improbable(found), crop=crop.mask)
-    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
+    seen = Observation.of(data, mask).without_support(shape, support).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
     origin = floating_origin(shape, seen.points)
     seen, known = to_local(seen, origin), to_local(known, origin)
