@@ -46,6 +46,30 @@ class Scene:
     pose: Tensor | None = None
     keypoints: Tensor | None = None
 
+    def is_right(self, pose: Tensor) -> bool:
+        """Return whether a pose is the true one: a hand's fingertips within 15 mm on average, an arm see below."""
+        if self.pose is None:
+            return False
+        if self.keypoints is None:
+            return arm_is_right(pose, self.pose)
+        tips = slice(4, None, 4)
+        return float((self.shape.keypoints(pose)[tips] - self.keypoints[tips]).norm(dim=-1).mean()) <= 0.015
+
+
+def arm_is_right(pose: Tensor, truth: Tensor) -> bool:
+    """Return whether a pose of a made-up arm is off by at most 3 degrees in its joints and 20 mm at its foot.
+
+    The foot looks alike after half a turn about its axis, with which the first joint turns back.
+    """
+    turned = truth.clone()
+    turned[3:6] = so3_log((so3_exp(truth[None, 3:6]) @ so3_exp(truth.new_tensor([[0.0, 0.0, math.pi]])))[0][None])[0]
+    turned[6] += math.pi
+    joints = min(
+        float((pose[6:] - each[6:] + math.pi).remainder(2 * math.pi).sub(math.pi).abs().max())
+        for each in (truth, turned)
+    )
+    return joints <= math.radians(3) and float((pose[:3] - truth[:3]).norm()) <= 0.02
+
 
 def box(size: Sequence[float]) -> TriangleMesh:
     """Return a box about the origin, sides in metres."""
@@ -154,14 +178,29 @@ def seen_from(size: float, generator: torch.Generator, target: float) -> tuple[T
     return turn, -turn @ position
 
 
-def photographed(meshes: Sequence[TriangleMesh], generator: torch.Generator, sensor: DepthNoise) -> tr.DepthFrame:
-    """Return the picture of meshes in camera coordinates; what lies behind the camera is left out."""
+def photographed(
+    meshes: Sequence[TriangleMesh], generator: torch.Generator, sensor: DepthNoise, window: int = 0
+) -> tr.DepthFrame:
+    """Return the picture of meshes in camera coordinates, averaged over windows as by stereo matching.
+
+    What lies behind the camera is left out.
+    """
     scene = joined(meshes)
     kept = (scene.vertices[scene.faces][..., 2] > 0.05).all(-1)
     camera = tr.Camera(WIDTH, HEIGHT, (FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1)))
     raster = rasterize(TriangleMesh(scene.vertices, scene.faces[kept]), camera.view())
     depth = torch.where(raster.face_index >= 0, raster.depth, 0.0).float()
-    return tr.DepthFrame(sensor.measured(depth, generator), camera)
+    return tr.DepthFrame(sensor.measured(averaged(depth, window), generator), camera)
+
+
+def averaged(depth: Tensor, radius: int, step: float = 0.03) -> Tensor:
+    """Return depths (H, W) averaged over the pixels within a radius that differ by less than a step, metres."""
+    if radius == 0:
+        return depth
+    side = 2 * radius + 1
+    around = torch.nn.functional.pad(depth, (radius,) * 4).unfold(0, side, 1).unfold(1, side, 1).flatten(-2)
+    near = (around > 0) & ((around - depth.unsqueeze(-1)).abs() < step)
+    return torch.where(depth > 0, (around * near).sum(-1) / near.sum(-1).clamp_min(1), depth)
 
 
 def divided(mesh: TriangleMesh, edge: float) -> TriangleMesh:
@@ -185,6 +224,7 @@ def hand_scene(seed: int, there: bool) -> Scene:
     """Return a hand with its forearm over a table, or the table alone."""
     generator = torch.Generator().manual_seed(seed)
     hand, size = tr.Hand(), 0.26
+    person, window = varied(seed)
     turn, place = seen_from(size, generator, 0.1 if there else 0.0)
     meshes = [moved(divided(mesh, 0.2), turn, place) for mesh in room(size, generator, 0.4 * size)]
     pose = random_hand_pose(hand, generator, bend=uniform(generator, 0.1, 0.7))
@@ -193,11 +233,18 @@ def hand_scene(seed: int, there: bool) -> Scene:
             keys = hand.keypoints(pose)
             lift = torch.tensor([0.0, 0.0, uniform(generator, 0.08, 0.2)])
             pose[:3] += turn @ lift + place - keys.mean(0)
-            keys, skin = hand.keypoints(pose), surface_skin(hand)
+            keys, skin = person.keypoints(pose), surface_skin(person)
             meshes += [TriangleMesh(skin(pose), skin.faces), forearm(keys)]
-    sensor = SENSORS[seed % len(SENSORS)]
-    picture = photographed(meshes, generator, sensor)
+    picture = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], window)
     return Scene("hand", hand, picture, pose, keys) if there else Scene("hand", hand, picture)
+
+
+def varied(seed: int) -> tuple[tr.Hand, int]:
+    """Return a hand of other proportions and the radius of a sensor's window; the plain hand and none in tests."""
+    if seed < TRAINING_SEEDS:
+        return tr.Hand(), 0
+    generator = torch.Generator().manual_seed(seed + 1)
+    return other_hand(generator, uniform(generator, 0.0, 0.06)), int(uniform(generator, 0, 4))
 
 
 def forearm(keys: Tensor) -> TriangleMesh:
@@ -221,8 +268,8 @@ def arm_scene(seed: int, there: bool) -> Scene:
     if there:
         skin = arm.file_skin()
         meshes.append(TriangleMesh(skin(pose).detach(), skin.faces))
-    sensor = SENSORS[seed % len(SENSORS)]
-    return Scene("arm", arm, photographed(meshes, generator, sensor), pose if there else None)
+    frame = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], varied(seed)[1])
+    return Scene("arm", arm, frame, pose if there else None)
 
 
 def held_scene(seed: int, there: bool) -> Scene:
@@ -232,7 +279,7 @@ def held_scene(seed: int, there: bool) -> Scene:
     turn, place = seen_from(size, generator, 0.1)
     meshes = [moved(divided(mesh, 0.2), turn, place) for mesh in room(size, generator, 0.4 * size)]
     lift = torch.tensor([0.0, 0.0, uniform(generator, 0.05, 0.2)])
-    sensor, keys, pose = SENSORS[seed % len(SENSORS)], None, None
+    keys, pose, window = None, None, int(uniform(generator, 0, 4))
     if there:
         hand = other_hand(generator, uniform(generator, 0.0, 0.06))
         pose, skin = random_hand_pose(hand, generator, bend=uniform(generator, 0.2, 0.8)), surface_skin(hand)
@@ -247,7 +294,8 @@ def held_scene(seed: int, there: bool) -> Scene:
         thing = creature(generator, size * uniform(generator, 0.5, 1.0), held_out=seed < TRAINING_SEEDS)
         tilt = so3_exp(torch.tensor([[uniform(generator, 0, 3), 0.0, uniform(generator, -3, 3)]]))[0]
         meshes.append(moved(thing, tilt, turn @ lift + place))
-    return Scene("held", tr.Hand(), photographed(meshes, generator, sensor), pose, keys)
+    frame = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], window)
+    return Scene("held", tr.Hand(), frame, pose, keys)
 
 
 def held_thing(generator: torch.Generator) -> TriangleMesh:

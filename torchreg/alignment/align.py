@@ -29,7 +29,7 @@ from torchreg.alignment.evidence.observability import dof_confidence
 from torchreg.alignment.evidence.reliability import without_cut
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
 from torchreg.alignment.fit.annealed_em import OnStep, StageResult
-from torchreg.alignment.fit.problem import centered_problem, masked_mean, model_size
+from torchreg.alignment.fit.problem import centered_problem, masked_mean
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
@@ -39,7 +39,7 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.search.in_picture import not_found_if_improbable, surest_crop
+from torchreg.alignment.search.in_picture import align_in_picture
 from torchreg.alignment.search.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
@@ -157,16 +157,11 @@ def align(
         return replace(found, shape=shape)
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = _model_skin(shape, model_points, shape.rest[None], config)
-        found, crop = surest_crop(
-            data,
-            model_size(skin),
-            partial(
-                align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
-                keypoint_std=keypoint_std, fit_shape=fit_shape, initializer=initializer, config=config, on_step=on_step,
-            ),
-            partial(source.crop_score, skin),
+        aligned = partial(
+            align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std,
+            fit_shape=fit_shape, initializer=initializer, on_step=on_step,
         )  # fmt: skip
-        return replace(not_found_if_improbable(found), crop=crop.mask)
+        return align_in_picture(data, skin, aligned, config, partial(source.crop_score, skin))
     seen = Observation.of(data, mask).without_support(shape, support).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
     origin = floating_origin(shape, seen.points)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.confidence import limb_points
-from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.problem import AlignProblem, centered_problem
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.geometry.normals import fit_normals
+from torchreg.shapes.pose_algebra import shifted
+from torchreg.shapes.skin import LinearBlendSkin
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class _Look:
     """How surfaces are compared; lengths are shares of the shape's size."""
 
     on_shape: float = 0.03  # distance of data on the shape: a fit of another hand errs by .02
-    facing: float = 0.3  # cosine between a normal and the direction to the camera from which on a surface is visible
+    facing: float = 0.3  # cosine between a normal and the direction to the camera of a visible surface, at least
     ray: tuple[float, ...] = (
         0.04,
         0.07,
@@ -30,7 +31,9 @@ class _Look:
         0.6,
     )  # steps to the camera in which the shape may hide itself
     least: int = 4  # visible points of a limb that say whether it is in the picture
+    half: float = 0.5  # confirmed share of a limb from which on it counts
     num_data: int = 800  # whose normals are compared
+    around: int = 16  # neighbors that give a normal
     detail: float = 0.12  # radius within which normals are compared with their mean
     neighbors: int = 24  # that give the mean
 
@@ -38,83 +41,123 @@ class _Look:
 _LOOK = _Look()
 
 
-@dataclass(frozen=True, eq=False)
-class PictureAgreement:
-    """Agreement of pictures with poses, (B,) each, from 0 to 1 unless said.
+@dataclass(frozen=True)
+class PictureModel:
+    """The logistic model of a whole picture's confidence: log-odds of a right pose, ``bias - sum_k weight_k e_k``.
 
-    Args:
-        agrees: share of the shape's visible surface where the picture has it.
-        behind: share of it through which the picture shows something farther.
-        hidden: share of it before which the picture shows something nearer.
-        weakest: `agrees` of the limb that agrees least, those that the picture does not show left out.
-        limbs: share of all limbs of which half agrees or more.
-        normals: mean cosine between the normals of data and shape.
-        relief: correlation of the details of their normals, from -1 to 1: smooth things have none.
-        amplitude: logarithm of the data's details over the shape's.
-        covered: area that data on the shape show, as a share of the surface that would be visible.
+    The evidence is that of `Evidence`, then that of `PictureAgreement`. Fitted by ``benchmarks/scenes.py --calibrate``
+    to the crops of made-up rooms with hands, arms and other things, of which most do not show the shape.
     """
 
-    agrees: Tensor
+    bias: float = 6.15
+    weights: tuple[float, ...] = (
+        2.44, 0.0, 0.15, 0.39, 2.43, 2.27, 0.0, 1.33, 1.51, 0.68, 1.91, 1.68, 11.18, 0.3, 1.2, 1.76, 1.61, 3.63,
+    )  # fmt: skip
+
+    def confidence(self, evidence: Tensor) -> Tensor:
+        """Return the probability (...) that poses with evidence (..., E) are right."""
+        return torch.sigmoid(self.bias - evidence @ evidence.new_tensor(self.weights))
+
+
+PICTURE_MODEL = PictureModel()
+
+
+@dataclass(frozen=True, eq=False)
+class PictureAgreement:
+    """How a whole picture speaks against a pose, () each: from 0 (agrees) to 1, and so on for `smooth`.
+
+    Args:
+        behind: share of the shape's visible surface through which the picture shows something farther.
+        hidden: share of it before which the picture shows something nearer.
+        weakest: what the picture does not confirm of the limb's visible surface that it confirms least.
+        limbs: share of the limbs of which less than half is confirmed.
+        normals: one less the mean cosine between the normals of data and shape.
+        relief: one less the correlation of the details of these normals: a ball has none.
+        smooth: logarithm of the shape's details over the data's, at least zero.
+        uncovered: share of the surface that a camera might see that the picture does not confirm.
+    """
+
     behind: Tensor
     hidden: Tensor
     weakest: Tensor
     limbs: Tensor
     normals: Tensor
     relief: Tensor
-    amplitude: Tensor
-    covered: Tensor
+    smooth: Tensor
+    uncovered: Tensor
 
     def table(self) -> Tensor:
-        """Return the numbers as (B, E)."""
-        return torch.stack([getattr(self, item.name) for item in fields(self)], dim=-1)
+        """Return the numbers as (E,)."""
+        return torch.stack([getattr(self, item.name) for item in fields(self)])
 
     @classmethod
-    def of(cls, problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> PictureAgreement:
-        """Return how frames, one for each of poses (B, num_dofs), agree with them."""
-        rows = [
-            _agreement(problem.rows(torch.tensor([row])), pose[row, None], frame) for row, frame in enumerate(frames)
-        ]
-        table = torch.stack([torch.stack(row) for row in rows])
-        return cls(*table.unbind(-1))
+    @torch.no_grad()
+    def of(cls, skin: LinearBlendSkin, pose: Tensor, frame: DepthFrame) -> PictureAgreement:
+        """Return how a frame, a crop of the picture, agrees with a pose (num_dofs,) of a skin's shape."""
+        origin = frame.points.double().mean(0)
+        frame = frame.near(origin)
+        data, pose = frame.points[None].to(skin.points), shifted(pose[None].double(), -origin[None]).to(skin.points)
+        valid = torch.ones_like(data[..., 0], dtype=torch.bool)
+        problem = centered_problem(skin, data, valid, pose, data.new_zeros(1, 3), prior_std=None, pose_atol=0.0)
+        look = _Surface.of(problem, pose, frame)
+        normals, relief, smooth = _normal_agreement(problem, pose, frame)
+        least, unconfirmed = look.limbs(problem)
+        return cls(
+            behind=look.share(look.gap > _LOOK.on_shape),
+            hidden=look.share(look.gap < -_LOOK.on_shape),
+            weakest=1 - least,
+            limbs=unconfirmed,
+            normals=1 - normals,
+            relief=1 - relief,
+            smooth=smooth.clamp_min(0),
+            uncovered=1 - look.confirmed.sum() / look.visible.sum().clamp_min(1),
+        )
 
 
-def _agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> list[Tensor]:
-    """Return the numbers of one pose (1, num_dofs) in a frame."""
-    posed = problem.skin(pose)
-    normal = _shape_normals(problem, pose, posed)[0]
-    posed = posed[0]
-    eye = frame.camera.position.to(posed) - problem.origin[0].to(posed)
-    toward = torch.nn.functional.normalize(eye - posed, dim=-1)
-    visible = (normal * toward).sum(-1) > _LOOK.facing
-    steps = problem.size * posed.new_tensor(_LOOK.ray)
-    rays = posed + steps[:, None, None] * toward
-    inside = problem.surface.distance(rays.reshape(1, -1, 3), pose).reshape(len(steps), -1)
-    visible &= (inside > 0).all(0)
-    pixels, depth = frame.camera.project(posed.double() + problem.origin[0].double())
-    column, row = pixels.nan_to_num(-1).round().long().unbind(-1)
-    height, width = frame.depth.shape
-    framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    measured = frame.depth[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    gap = (measured - depth.to(measured)) / problem.size
-    known = visible & framed & (measured > 0)
-    agrees, behind, hidden = (
-        known & flag for flag in (gap.abs() <= _LOOK.on_shape, gap > _LOOK.on_shape, gap < -_LOOK.on_shape)
-    )
-    count = known.sum().clamp_min(1)
-    shares = [
-        (agrees[index].sum() / known[index].sum(), bool(known[index].sum() >= _LOOK.least))
-        for _, index in limb_points(problem.skin)
-    ]
-    shown = torch.stack([share for share, is_known in shares if is_known] or [agrees.sum() / count])
-    data = _data_details(problem, pose, frame)
-    number = [
-        agrees.sum() / count,
-        behind.sum() / count,
-        hidden.sum() / count,
-        shown.amin(),
-        (shown > 0.5).sum() / max(1, len(shares)),
-    ]
-    return [value.to(pose) for value in (*number, *data, agrees.sum() / visible.sum().clamp_min(1))]
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Points (N,) of a posed skin: those visible, those of which a depth was measured, and how far behind it is.
+
+    `gap` is a share of the shape's size.
+    """
+
+    visible: Tensor
+    known: Tensor
+    gap: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> _Surface:
+        """Return what a picture shows where the surface of a pose (1, num_dofs) would be."""
+        posed = problem.skin(pose)
+        normal, posed = _shape_normals(problem, pose, posed)[0], posed[0]
+        toward = torch.nn.functional.normalize(frame.camera.position.to(posed) - posed, dim=-1)
+        rays = posed + problem.size * posed.new_tensor(_LOOK.ray)[:, None, None] * toward
+        clear = problem.surface.distance(rays.reshape(1, -1, 3), pose).reshape(len(rays), -1) > 0
+        visible = ((normal * toward).sum(-1) > _LOOK.facing) & clear.all(0)
+        pixels, depth = frame.camera.project(posed)
+        column, row = pixels.nan_to_num(-1).round().long().unbind(-1)
+        height, width = frame.depth.shape
+        framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        measured = frame.depth[row.clamp(0, height - 1), column.clamp(0, width - 1)].to(depth)
+        return cls(visible, visible & framed & (measured > 0), (measured - depth) / problem.size)
+
+    @property
+    def confirmed(self) -> Tensor:
+        """Which points lie where the picture has a surface, (N,)."""
+        return self.known & (self.gap.abs() <= _LOOK.on_shape)
+
+    def share(self, which: Tensor) -> Tensor:
+        """Return the share () of the measured points that are some (N,)."""
+        return ((which & self.known).sum() / self.known.sum().clamp_min(1)).to(self.gap)
+
+    def limbs(self, problem: AlignProblem) -> tuple[Tensor, Tensor]:
+        """Return the least confirmed share () of limbs in the picture, and the share () of all limbs below a half."""
+        index = [points for _, points in limb_points(problem.skin)] or [torch.arange(len(self.gap))]
+        counts = torch.stack([torch.stack((self.confirmed[i].sum(), self.known[i].sum())) for i in index])
+        shares = counts[:, 0] / counts[:, 1].clamp_min(1)
+        in_picture = shares[counts[:, 1] >= _LOOK.least]
+        least = in_picture.amin() if len(in_picture) else shares.new_zeros(())
+        return least.to(self.gap), (shares < _LOOK.half).to(self.gap).mean()
 
 
 def _shape_normals(problem: AlignProblem, pose: Tensor, points: Tensor) -> Tensor:
@@ -123,22 +166,25 @@ def _shape_normals(problem: AlignProblem, pose: Tensor, points: Tensor) -> Tenso
     return torch.nn.functional.normalize(slope, dim=-1)
 
 
-def _data_details(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> list[Tensor]:
-    """Return agreement of normals, correlation of their details, and logarithm of their amplitudes."""
+def _normal_agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean cosine between normals of data and shape, and the correlation and log ratio of their details.
+
+    Details are differences of normals from their mean nearby.
+    """
     data = problem.data[0][problem.valid[0]]
-    on_shape = problem.surface.distance(data[None], pose)[0].abs() < _LOOK.on_shape * problem.size
-    data = data[on_shape]
+    data = data[problem.surface.distance(data[None], pose)[0].abs() < _LOOK.on_shape * problem.size]
     if len(data) <= _LOOK.neighbors:
-        return [data.new_zeros(()), data.new_zeros(()), data.new_zeros(())]
+        nothing = data.new_zeros(())
+        return nothing, nothing, nothing
     stride = -(-len(data) // _LOOK.num_data)
-    normals = fit_normals(data.double(), k_nearest_others(data.double(), 16)[0]).to(data)
+    normals = fit_normals(data.double(), k_nearest_others(data.double(), _LOOK.around)[0]).to(data)
     data, normals = data[::stride], normals[::stride]
-    eye = frame.camera.position.to(data) - problem.origin[0].to(data)
-    normals = torch.where(((eye - data) * normals).sum(-1, keepdim=True) < 0, -normals, normals)
+    toward = frame.camera.position.to(data) - data
+    normals = torch.where((toward * normals).sum(-1, keepdim=True) < 0, -normals, normals)
     expected = _shape_normals(problem, pose, data[None])[0]
     index, apart = k_nearest_others(data, min(_LOOK.neighbors, len(data) - 1))
     near = (apart < _LOOK.detail * problem.size).to(data).unsqueeze(-1)
-    details = [values - (values + (values[index] * near).sum(1)) / (1 + near.sum(1)) for values in (normals, expected)]
-    squares = [detail.square().sum().clamp_min(1e-9) for detail in details]
-    relief = (details[0] * details[1]).sum() / (squares[0] * squares[1]).sqrt()
-    return [(normals * expected).sum(-1).mean(), relief, 0.5 * (squares[0] / squares[1]).log()]
+    measured, wanted = (n - (n + (n[index] * near).sum(1)) / (1 + near.sum(1)) for n in (normals, expected))
+    energy = [detail.square().sum().clamp_min(1e-9) for detail in (measured, wanted)]
+    relief = (measured * wanted).sum() / (energy[0] * energy[1]).sqrt()
+    return (normals * expected).sum(-1).mean(), relief, 0.5 * (energy[1] / energy[0]).log()

@@ -1,16 +1,22 @@
-"""A shape in a whole picture: the crops that may show it are tried, and the surest answer is kept."""
+"""A shape in a whole picture: the crops that may show it are tried, and the most probable answer is kept."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
+import torch
+
+from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureAgreement
 from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import candidate_crops
 from torchreg.result import Status
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,36 @@ class Choice:
 
 CHOICE = Choice()
 Answer = TypeVar("Answer", AlignResult, PoseStarts)
+
+
+class Aligner(Protocol):
+    """What aligns a shape to a crop with given settings."""
+
+    def __call__(self, crop: DepthFrame, *, config: AlignConfig) -> AlignResult: ...  # noqa: D102
+
+
+def align_in_picture(
+    frame: DepthFrame,
+    skin: LinearBlendSkin,
+    aligned: Aligner,
+    config: AlignConfig,
+    crop_score: Callable[[DepthFrame], float],
+) -> AlignResult:
+    """Return the most probable alignment to crops of a frame, with the confidence of `PICTURE_MODEL`, and its crop.
+
+    All crops are aligned without a search around the result; then the most probable one with it, if it is in doubt.
+    NOT_FOUND where even the most probable pose is hardly right.
+    """
+
+    def answer(settings: AlignConfig, crop: DepthFrame) -> AlignResult:
+        return judged(aligned(crop, config=settings), crop, skin, config)
+
+    quick = replace(config, search="never")
+    found, crop = surest_crop(frame, model_size(skin), lambda crop: answer(quick, crop), crop_score)
+    if _confidence(found) < CHOICE.sure and config.search != "never" and found.coefficients is None:
+        searched = answer(config, crop)
+        found = searched if _confidence(searched) > _confidence(found) else found
+    return replace(_not_found_if_improbable(found), crop=crop.mask)
 
 
 def surest_crop(
@@ -50,7 +86,24 @@ def surest_crop(
     return answer(everything), everything
 
 
-def not_found_if_improbable(found: AlignResult) -> AlignResult:
+def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin, config: AlignConfig) -> AlignResult:
+    """Return the alignment to a crop of a whole picture with its evidence and confidence by `PICTURE_MODEL`."""
+    if found.shape is not None and found.coefficients is not None:
+        skin = sample_skin(found.shape)
+    agreement = PictureAgreement.of(skin, found.pose, crop)
+    evidence = torch.cat([torch.as_tensor(found.evidence), agreement.table().to(found.pose)])
+    confidence = PICTURE_MODEL.confidence(evidence)
+    status = found.statuses[0]
+    if status.usable or status is Status.DOUBTFUL:
+        is_still = float(found.history[-1].pose_change.max()) <= config.pose_atol
+        was_usable = status if status.usable else Status.CONVERGED if is_still else Status.MAX_STEPS
+        status = was_usable if float(confidence) >= CALIBRATION.doubtful else Status.DOUBTFUL
+    else:
+        confidence = torch.zeros_like(confidence)
+    return replace(found, evidence=evidence, confidence=confidence, status=status)
+
+
+def _not_found_if_improbable(found: AlignResult) -> AlignResult:
     """Return the result of a whole picture, NOT_FOUND where even the most probable pose is hardly right."""
     confidence = _confidence(found)
     if found.statuses[0].usable or confidence >= CHOICE.not_found:
