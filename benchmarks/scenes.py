@@ -37,6 +37,7 @@ from confidence import area_under_curve, fitted_model
 import torchreg as tr
 from experiments.made_up.rooms import KINDS, TRAINING_SEEDS, Scene
 from torchreg.alignment.evidence.picture_agreement import PictureModel
+from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.search.in_picture import judged
 from torchreg.capture.depth_segments import candidate_crops
 
@@ -99,9 +100,13 @@ def crop_cases(kind: str, seed: int, there: bool) -> Iterator[tuple[Tensor, bool
 
 
 def calibrated(rows: Sequence[tuple[Tensor, bool]]) -> PictureModel:
-    """Return the model of highest likelihood on crops."""
-    bias, weights = fitted_model(torch.stack([row[0] for row in rows]), torch.tensor([row[1] for row in rows]))
-    return PictureModel(round(bias, 2), weights)
+    """Return the model of highest likelihood on crops: the weights of the first evidence are scaled together."""
+    table, right = torch.stack([row[0] for row in rows]).double(), torch.tensor([row[1] for row in rows])
+    held = torch.tensor(CALIBRATION.weights, dtype=torch.float64)
+    before = table[:, : len(held)] @ held - CALIBRATION.bias
+    bias, (scale, *added) = fitted_model(torch.cat([before.unsqueeze(-1), table[:, len(held) :]], dim=-1), right)
+    weights = (*(round(scale * weight, 2) for weight in CALIBRATION.weights), *added)
+    return PictureModel(round(bias + scale * CALIBRATION.bias, 2), weights)
 
 
 def render(rows: Sequence[Row]) -> str:

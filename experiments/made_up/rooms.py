@@ -57,18 +57,20 @@ class Scene:
 
 
 def arm_is_right(pose: Tensor, truth: Tensor) -> bool:
-    """Return whether a pose of a made-up arm is off by at most 3 degrees in its joints and 20 mm at its foot.
+    """Return whether a pose of a made-up arm is off by at most 3 degrees, joints and foot, and its foot by 20 mm.
 
     The foot looks alike after half a turn about its axis, with which the first joint turns back.
     """
-    turned = truth.clone()
-    turned[3:6] = so3_log((so3_exp(truth[None, 3:6]) @ so3_exp(truth.new_tensor([[0.0, 0.0, math.pi]])))[0][None])[0]
-    turned[6] += math.pi
-    joints = min(
-        float((pose[6:] - each[6:] + math.pi).remainder(2 * math.pi).sub(math.pi).abs().max())
-        for each in (truth, turned)
-    )
-    return joints <= math.radians(3) and float((pose[:3] - truth[:3]).norm()) <= 0.02
+    for angle in (0.0, math.pi):
+        foot = so3_exp(truth.new_tensor([[0.0, 0.0, angle]]))
+        turn = so3_exp(pose[None, 3:6]).mT @ so3_exp(truth[None, 3:6]) @ foot
+        joints = pose[6:] - truth[6:]
+        joints[0] -= angle
+        joints = (joints + math.pi).remainder(2 * math.pi) - math.pi
+        off = max(float(so3_log(turn).norm()), float(joints.abs().max()))
+        if off <= math.radians(3) and float((pose[:3] - truth[:3]).norm()) <= 0.02:
+            return True
+    return False
 
 
 def box(size: Sequence[float]) -> TriangleMesh:

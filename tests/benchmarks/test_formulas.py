@@ -107,14 +107,12 @@ def test_logistic_models_find_the_odds_that_made_the_cases(load):
     assert bias == pytest.approx(2.0, abs=0.4)
     assert weights == pytest.approx((4.0, 0.0, 1.0), abs=0.6)
     bench = load("scenes")
-    evidence = torch.rand(3000, len(bench.CALIBRATION.weights), generator=generator) * 0.3
-    weights = tensor([*bench.CALIBRATION.weights[:-2], 6.0, 2.0])
-    right = torch.rand(3000, generator=generator) < torch.sigmoid(bench.CALIBRATION.bias - evidence @ weights)
-    rows = [
-        bench.Row("hand", True, bool(found), True, 0.5, row, 1.0) for found, row in zip(right, evidence, strict=True)
-    ]
-    assert bench.calibrated(rows) == pytest.approx((6.0, 2.0), abs=0.8)
-    assert "sure and wrong" in bench.render(rows)
+    held, added = tensor(bench.CALIBRATION.weights), tensor([0.5, 0.0, 1.0, 0.0, 2.0, 6.0, 0.0, 1.0])
+    evidence = torch.rand(3000, len(held) + len(added), generator=generator) * 0.3
+    odds = 0.8 * (bench.CALIBRATION.bias - evidence[:, : len(held)] @ held) + 1 - evidence[:, len(held) :] @ added
+    right = torch.rand(3000, generator=generator) < torch.sigmoid(odds)
+    model = bench.calibrated([(row, bool(found)) for row, found in zip(evidence, right, strict=True)])
+    assert float((model.confidence(evidence) - torch.sigmoid(odds)).abs().mean()) < 0.03
     bench, evidence = load("shape_confidence"), tensor([[0.0], [0.1], [0.2], [0.8], [0.9], [1.0]])
     assert (bench.left_out(evidence, evidence[:, 0] < 0.5) > 0.5).tolist() == [True] * 3 + [False] * 3
 
