@@ -24,7 +24,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -36,9 +36,8 @@ from confidence import area_under_curve, fitted_model
 
 import torchreg as tr
 from experiments.made_up.rooms import KINDS, TRAINING_SEEDS, Scene
-from torchreg.alignment.evidence.picture_agreement import PictureModel
-from torchreg.alignment.evidence.reliability import CALIBRATION
-from torchreg.alignment.search.in_picture import judged
+from torchreg.alignment.evidence.picture_agreement import PictureAgreement, PictureModel
+from torchreg.alignment.fit.problem import model_size
 from torchreg.capture.depth_segments import candidate_crops
 
 MOST_CROPS = 4  # of a picture that the model is fitted to
@@ -87,26 +86,28 @@ def measure(kind: str, seed: int, there: bool) -> Row:
 
 
 def crop_cases(kind: str, seed: int, there: bool) -> Iterator[tuple[Tensor, bool]]:
-    """Yield the evidence (E,) of alignments to the first crops of a picture, and whether they are right."""
+    """Yield the agreement (E,) of poses found in the first crops of a picture, and whether they lie on the shape.
+
+    Where the shape is in a crop, it is also fitted from the true pose.
+    """
     scene = KINDS[kind](seed, there)
     skin, quick = tr.sample_skin(scene.shape), tr.AlignConfig(search="never")
-    size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
-    crops = [crop for surface in candidate_crops(scene.frame, size) for crop in surface]
+    near = replace(quick, schedule=tr.SigmaSchedule.geometric(0.008, 0.004, 2))
+    crops = [crop for surface in candidate_crops(scene.frame, model_size(skin)) for crop in surface]
+    starts = [(None, quick)] + [(scene.pose, near)] * there
     for crop in crops[:MOST_CROPS]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = judged(tr.align(scene.shape, crop, model_points=skin, config=quick), crop, skin, quick)
-        yield found.evidence, scene.is_right(found.pose)
+        for start, config in starts:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                pose = tr.align(scene.shape, crop, start, model_points=skin, config=config).pose
+            yield PictureAgreement.of(skin, pose, crop).table(), scene.is_near(pose, model_size(skin))
 
 
 def calibrated(rows: Sequence[tuple[Tensor, bool]]) -> PictureModel:
-    """Return the model of highest likelihood on crops: the weights of the first evidence are scaled together."""
-    table, right = torch.stack([row[0] for row in rows]).double(), torch.tensor([row[1] for row in rows])
-    held = torch.tensor(CALIBRATION.weights, dtype=torch.float64)
-    before = table[:, : len(held)] @ held - CALIBRATION.bias
-    bias, (scale, *added) = fitted_model(torch.cat([before.unsqueeze(-1), table[:, len(held) :]], dim=-1), right)
-    weights = (*(round(scale * weight, 2) for weight in CALIBRATION.weights), *added)
-    return PictureModel(round(bias + scale * CALIBRATION.bias, 2), weights)
+    """Return the model of highest likelihood on crops, at even odds before."""
+    near = torch.tensor([row[1] for row in rows])
+    bias, weights = fitted_model(torch.stack([row[0] for row in rows]), near)
+    return PictureModel(round(bias - float(near.double().mean().logit()), 2), weights)
 
 
 def render(rows: Sequence[Row]) -> str:
@@ -146,9 +147,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.calibrate:
         print(calibrated([row for case in bar for row in crop_cases(*case)]))
         return 0
-    rows = [measure(*case) for case in bar]
-    if given.list:
-        print("\n".join(row.line() for row in rows))
+    rows = []
+    for case in bar:
+        rows.append(measure(*case))
+        if given.list:
+            print(rows[-1].line(), flush=True)
     print(render(rows))
     return 0
 

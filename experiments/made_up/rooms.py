@@ -55,6 +55,13 @@ class Scene:
         tips = slice(4, None, 4)
         return float((self.shape.keypoints(pose)[tips] - self.keypoints[tips]).norm(dim=-1).mean()) <= 0.015
 
+    def is_near(self, pose: Tensor, size: float) -> bool:
+        """Return whether a pose lies about on the shape: keypoints within 15 % of its size, metres, on average."""
+        if self.pose is None:
+            return False
+        truth = self.shape.keypoints(self.pose) if self.keypoints is None else self.keypoints
+        return float((self.shape.keypoints(pose) - truth).norm(dim=-1).mean()) <= 0.15 * size
+
 
 def arm_is_right(pose: Tensor, truth: Tensor) -> bool:
     """Return whether a pose of a made-up arm is off by at most 3 degrees, joints and foot, and its foot by 20 mm.

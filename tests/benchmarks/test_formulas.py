@@ -107,12 +107,12 @@ def test_logistic_models_find_the_odds_that_made_the_cases(load):
     assert bias == pytest.approx(2.0, abs=0.4)
     assert weights == pytest.approx((4.0, 0.0, 1.0), abs=0.6)
     bench = load("scenes")
-    held, added = tensor(bench.CALIBRATION.weights), tensor([0.5, 0.0, 1.0, 0.0, 2.0, 6.0, 0.0, 1.0])
-    evidence = torch.rand(3000, len(held) + len(added), generator=generator) * 0.3
-    odds = 0.8 * (bench.CALIBRATION.bias - evidence[:, : len(held)] @ held) + 1 - evidence[:, len(held) :] @ added
-    right = torch.rand(3000, generator=generator) < torch.sigmoid(odds)
-    model = bench.calibrated([(row, bool(found)) for row, found in zip(evidence, right, strict=True)])
-    assert float((model.confidence(evidence) - torch.sigmoid(odds)).abs().mean()) < 0.03
+    agreement = torch.rand(4000, 5, generator=generator)
+    odds = 1.0 - agreement @ tensor([4.0, 0.0, 1.0, 2.0, 1.0])
+    near = torch.rand(4000, generator=generator) < torch.sigmoid(odds)
+    model = bench.calibrated([(row, bool(found)) for row, found in zip(agreement, near, strict=True)])
+    even = odds - near.double().mean().logit()
+    assert float((model.probability(agreement) - torch.sigmoid(even)).abs().mean()) < 0.05
     bench, evidence = load("shape_confidence"), tensor([[0.0], [0.1], [0.2], [0.8], [0.9], [1.0]])
     assert (bench.left_out(evidence, evidence[:, 0] < 0.5) > 0.5).tolist() == [True] * 3 + [False] * 3
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
-import torch
-
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureAgreement
 from torchreg.alignment.evidence.reliability import CALIBRATION
@@ -45,14 +43,14 @@ def align_in_picture(
     config: AlignConfig,
     crop_score: Callable[[DepthFrame], float],
 ) -> AlignResult:
-    """Return the most probable alignment to crops of a frame, with the confidence of `PICTURE_MODEL`, and its crop.
+    """Return the most probable alignment to crops of a frame, and its crop.
 
     All crops are aligned without a search around the result; then the most probable one with it, if it is in doubt.
     NOT_FOUND where even the most probable pose is hardly right.
     """
 
     def answer(settings: AlignConfig, crop: DepthFrame) -> AlignResult:
-        return judged(aligned(crop, config=settings), crop, skin, config)
+        return judged(aligned(crop, config=settings), crop, skin)
 
     quick = replace(config, search="never")
     found, crop = surest_crop(frame, model_size(skin), lambda crop: answer(quick, crop), crop_score)
@@ -86,21 +84,17 @@ def surest_crop(
     return answer(everything), everything
 
 
-def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin, config: AlignConfig) -> AlignResult:
-    """Return the alignment to a crop of a whole picture with its evidence and confidence by `PICTURE_MODEL`."""
+def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin) -> AlignResult:
+    """Return the alignment to a crop of a picture, in doubt where `PICTURE_MODEL` says that something else is there."""
     if found.shape is not None and found.coefficients is not None:
         skin = sample_skin(found.shape)
-    agreement = PictureAgreement.of(skin, found.pose, crop)
-    evidence = torch.cat([torch.as_tensor(found.evidence), agreement.table().to(found.pose)])
-    confidence = PICTURE_MODEL.confidence(evidence)
-    status = found.statuses[0]
-    if status.usable or status is Status.DOUBTFUL:
-        is_still = float(found.history[-1].pose_change.max()) <= config.pose_atol
-        was_usable = status if status.usable else Status.CONVERGED if is_still else Status.MAX_STEPS
-        status = was_usable if float(confidence) >= CALIBRATION.doubtful else Status.DOUBTFUL
-    else:
-        confidence = torch.zeros_like(confidence)
-    return replace(found, evidence=evidence, confidence=confidence, status=status)
+    there = float(PICTURE_MODEL.probability(PictureAgreement.of(skin, found.pose, crop).table()))
+    if there >= PICTURE_MODEL.against:
+        return found
+    reason = f"what the picture shows there looks like the shape with a probability of {there:.1%}"
+    status = Status.DOUBTFUL if found.statuses[0].usable else found.status
+    doubt = "; ".join(filter(None, (reason, str(found.doubt))))
+    return replace(found, confidence=found.confidence.clamp_max(there), status=status, doubt=doubt)
 
 
 def _not_found_if_improbable(found: AlignResult) -> AlignResult:
