@@ -107,14 +107,12 @@ def test_logistic_models_find_the_odds_that_made_the_cases(load):
     assert bias == pytest.approx(2.0, abs=0.4)
     assert weights == pytest.approx((4.0, 0.0, 1.0), abs=0.6)
     bench = load("scenes")
-    evidence = torch.rand(3000, len(bench.CALIBRATION.weights), generator=generator) * 0.3
-    weights = tensor([*bench.CALIBRATION.weights[:-2], 6.0, 2.0])
-    right = torch.rand(3000, generator=generator) < torch.sigmoid(bench.CALIBRATION.bias - evidence @ weights)
-    rows = [
-        bench.Row("hand", True, bool(found), True, 0.5, row, 1.0) for found, row in zip(right, evidence, strict=True)
-    ]
-    assert bench.calibrated(rows) == pytest.approx((6.0, 2.0), abs=0.8)
-    assert "sure and wrong" in bench.render(rows)
+    agreement = torch.rand(4000, 5, generator=generator)
+    odds = 1.0 - agreement @ tensor([4.0, 0.0, 1.0, 2.0, 1.0])
+    near = torch.rand(4000, generator=generator) < torch.sigmoid(odds)
+    model = bench.calibrated([(row, bool(found)) for row, found in zip(agreement, near, strict=True)])
+    even = odds - near.double().mean().logit()
+    assert float((model.probability(agreement) - torch.sigmoid(even)).abs().mean()) < 0.05
     bench, evidence = load("shape_confidence"), tensor([[0.0], [0.1], [0.2], [0.8], [0.9], [1.0]])
     assert (bench.left_out(evidence, evidence[:, 0] < 0.5) > 0.5).tolist() == [True] * 3 + [False] * 3
 

@@ -5,6 +5,9 @@ import math
 import pytest
 import torch
 
+from experiments.made_up import rooms
+from torchreg.geometry.rotation import so3_exp, so3_log
+
 
 def turn_between(one, other):
     """Return the angle in degrees of the rotation between two rotation vectors."""
@@ -73,23 +76,45 @@ def test_starts_of_rivals_are_as_far_off_as_stated(load, plain_hand, plain_hand_
     assert float(posed[:, 2].mean()) < float(every[:, 2].mean())
 
 
-def test_scenes_show_their_shape_where_its_pose_is(load):
-    bench = load("scenes")
-    for scene in (bench.hand_scene(4, there=True), bench.arm_scene(1, there=True)):
-        pixels, depth = scene.frame.camera.project(scene.shape.keypoints(scene.pose).double())
-        column, row = pixels.round().long().unbind(-1)
-        inside = (column >= 0) & (column < bench.WIDTH) & (row >= 0) & (row < bench.HEIGHT)
-        # Keypoints lie inside the shape, whose surface hides them; the pixel of a fingertip may miss it.
-        nearer = scene.frame.depth[row[inside], column[inside]] < depth[inside] + 0.02
-        assert float(nearer.double().mean()) > 0.7
-        assert bench.is_right(scene, scene.pose)
-        off = scene.pose.clone()
-        off[0] += 0.03
-        assert not bench.is_right(scene, off)
-    first, again = (bench.arm_scene(3, there=False) for _ in range(2))
-    assert torch.equal(first.frame.depth, again.frame.depth)
-    assert first.pose is None
-    assert not bench.is_right(first, first.shape.rest_pose())
+@pytest.mark.parametrize(("kind", "seed"), [("hand", 4), ("arm", 1), ("held", 2)])
+def test_scenes_show_their_shape_where_its_pose_is(kind, seed):
+    scene = rooms.KINDS[kind](seed, True)
+    keypoints = scene.shape.keypoints(scene.pose) if scene.keypoints is None else scene.keypoints
+    pixels, depth = scene.frame.camera.project(keypoints.double())
+    column, row = pixels.round().long().unbind(-1)
+    inside = (column >= 0) & (column < rooms.WIDTH) & (row >= 0) & (row < rooms.HEIGHT)
+    # Keypoints lie inside the shape, whose surface hides them; the pixel of a fingertip may miss it.
+    nearer = scene.frame.depth[row[inside], column[inside]] < depth[inside] + 0.02
+    assert float(nearer.double().mean()) > 0.7
+    assert scene.is_right(scene.pose)
+    off = scene.pose.clone()
+    off[0] += 0.03
+    assert not scene.is_right(off)
+    absent, again = (rooms.KINDS[kind](3, False) for _ in range(2))
+    assert torch.equal(absent.frame.depth, again.frame.depth)
+    assert absent.pose is None
+    assert not absent.is_right(absent.shape.rest_pose())
+
+
+def test_an_arm_is_right_after_half_a_turn_of_its_foot():
+    truth = torch.tensor([0.1, 0.2, 1.0, 0.3, -0.4, 0.2, 1.0, 0.5, -0.5])
+    turned = truth.clone()
+    turned[3:6] = so3_log(so3_exp(truth[None, 3:6]) @ torch.diag(torch.tensor([-1.0, -1.0, 1.0])))[0]
+    assert not rooms.arm_is_right(turned, truth)
+    turned[6] -= math.pi
+    assert rooms.arm_is_right(turned, truth)
+    turned[8] += 0.06
+    assert not rooms.arm_is_right(turned, truth)
+
+
+def test_windows_average_a_surface_but_not_across_its_rim():
+    depth = torch.full((9, 12), 1.0)
+    depth[:, 6:], depth[4, 3], depth[0, 0] = 0.5, 1.009, 0.0
+    found = rooms.averaged(depth, 1)
+    assert found[4, 3] == pytest.approx(1.001, abs=1e-5)
+    assert torch.equal(found[:, 6:], depth[:, 6:])
+    assert found[0, 0] == 0
+    assert torch.equal(rooms.averaged(depth, 0), depth)
 
 
 @pytest.mark.parametrize("script", ["scan_confidence", "scan_matching"])

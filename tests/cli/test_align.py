@@ -111,12 +111,13 @@ def test_options_reach_the_alignment(run, error_of, folder, tmp_path, interrupte
     save_points(tmp_path / "mm.xyz", 1000 * meters)
     given = interrupted("torchreg.alignment.align.align")
     common = "-o", tmp_path / "r"
-    options = "--sigma", "0.02:0.005:3", "--outlier", "volume", "--search", "always"
+    options = "--sigma", "0.02:0.005:3", "--outlier", "volume", "--search", "always", "--support", "keep"
     run("align", "hand-left", tmp_path / "mm.xyz", "--scale", "0.001", *options, *common)
     (_, data, start), known = given.pop()
     torch.testing.assert_close(data, meters, atol=1e-6, rtol=0)
     schedule = tr.SigmaSchedule.geometric(0.02, 0.005, 3)
     assert known["config"] == tr.AlignConfig(schedule=schedule, outlier="volume", search="always")
+    assert known["support"] == "keep"
     assert start is None  # the shape is searched for
     upright = "align", "hand", folder / "cloud0.ply", *common, "--upright"
     for more in (["--up", "x"], []):
@@ -204,6 +205,7 @@ def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of
     (("--side", "up"), "--side must be one of right, left, either"),
     (("--intrinsics", "list.json"), "--intrinsics has no meaning without --depth"),
     (("--depth",), "--depth takes --intrinsics FILE with the camera"),
+    (("--depth", "--support", "keep"), "--support is of clouds"),
 )
 def test_errors_are_one_line(error_of, folder, tmp_path, arguments, message):
     (tmp_path / "list.json").write_text("[1]", encoding="utf-8")

@@ -13,12 +13,11 @@ from torch import Tensor
 from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.fit.annealed_em import OnStep
-from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.inputs import Task
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.pose_rows import PoseRows
 from torchreg.alignment.results import AlignResult
-from torchreg.alignment.search.in_picture import not_found_if_improbable, surest_crop
+from torchreg.alignment.search.in_picture import align_in_picture
 from torchreg.alignment.search.landmark_fit import KeypointRows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
@@ -50,6 +49,7 @@ def align(
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
     initializer: PoseProposer | HoldsProposer | None = None,
+    support: str = "auto",
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
@@ -90,6 +90,8 @@ def align(
         keypoint_std: their standard deviation, () or (K,), in metres or pixels; by default 3 % of the shape's size, or
             5 pixels. Beyond three of them a keypoint is taken for wrong.
         initializer: a network that proposes poses where there is no start, see `find_pose`; the built-in hand has one.
+        support: of clouds: "auto" leaves out the table or floor that a scanned thing stands on, see `split_support`, as
+            if masked; not where the shape has a flat foot itself. "keep" takes all points for what was given.
         config: see `AlignConfig`.
         on_step: called with an `AlignRecord` after each iteration.
 
@@ -103,6 +105,7 @@ def align(
 
     Warns:
         DegenerateDataWarning: if the inliers lie at one place, on a line or on a plane; the status is DEGENERATE.
+        FileWarning: if a support is left out.
         UnitsWarning: if the data are more than thirty times larger or smaller than the shape.
 
     Differentiable: with ``fit_shape``, ``pose`` and ``coefficients`` once in ``data``, by the implicit function; which
@@ -124,14 +127,16 @@ def align(
     start = shape.pose_from_dict(initial_pose) if isinstance(initial_pose, Mapping) else initial_pose
     task = Task(
         shape=shape, source=source, config=config, model_points=model_points, known=known, start=start,
-        fit_shape=fit_shape is not False, clothed=clothed, on_step=on_step,
+        fit_shape=fit_shape is not False, clothed=clothed, support=support, on_step=on_step,
     )  # fmt: skip
     options: dict[str, Any] = {"keypoints": keypoints, "keypoint_std": keypoint_std}
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = task.skin()
-        aligned = partial(_aligned, replace(task, model_points=skin), **options)
-        found, crop = surest_crop(data, model_size(skin), aligned, partial(source.crop_score, skin))
-        return replace(not_found_if_improbable(found), crop=crop.mask)
+
+        def aligned(crop: DepthFrame, *, config: AlignConfig) -> AlignResult:
+            return _aligned(replace(task, model_points=skin, config=config), crop, **options)
+
+        return align_in_picture(data, skin, aligned, config, partial(source.crop_score, skin))
     return _aligned(task, data, mask, **options)
 
 

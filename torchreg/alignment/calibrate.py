@@ -19,8 +19,8 @@ from torchreg.alignment.found_frames import FramePoses
 from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.results import Calibration
 from torchreg.alignment.search.start_source import StartSource
-from torchreg.alignment.shape.person_rows import fit_scans
 from torchreg.alignment.shape.person_covariance import shared_covariance
+from torchreg.alignment.shape.person_rows import fit_scans
 from torchreg.alignment.shape.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
 from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy

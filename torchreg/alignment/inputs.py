@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from torchreg._checks import as_float_tensor, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_shape
 from torchreg.alignment.fit.landmarks import MeasuredKeypoints, keypoint_extent
 from torchreg.alignment.fit.problem import model_size
 from torchreg.capture.depth_frame import DepthFrame
@@ -22,6 +22,7 @@ from torchreg.geometry.far_origin import far_origin, to_local, to_world
 from torchreg.geometry.loaded import as_points
 from torchreg.geometry.sampling import draw_spread
 from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
+from torchreg.geometry.support import SUPPORTS, split_support, warn_about_support
 from torchreg.geometry.units import LENGTHS, likely_unit
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
@@ -48,6 +49,7 @@ class _Fitted:
     most: int = 10_000  # of a cloud: more move a pose by far less than models are exact
     searched: int = 4000  # of those, by candidates of a search, of which one is fitted again
     size_points: int = 200  # of a skin that tells the shape's size
+    support_points: int = 2000  # of a skin that says whether the shape has a flat foot of its own
 
 
 UNITS = UnitsCheck()
@@ -89,6 +91,32 @@ class Observation:
         if not several:
             return cls(clouds[0], None, space, tuple(frames))
         return cls(*_padded(clouds), space, tuple(frames))
+
+    def without_support(self, shape: ArticulatedShape, support: str) -> Observation:
+        """Return the same without the table or floor that a scanned thing stands on, unless the shape has a flat foot.
+
+        Whatever is wrong with the points is reported where they are checked.
+        """
+        check_choice(support, "support", SUPPORTS)
+        left = support == "keep" or self.frames or self.points is None
+        points = None if left else as_float_tensor(self.points, "data")
+        if points is None or points.ndim not in (2, 3) or points.shape[-1] != 3:
+            return self
+        valid = points.isfinite().all(-1)
+        if self.mask is not None and self.mask.shape != valid.shape:
+            return self
+        valid = valid if self.mask is None else valid & self.mask.to(valid.device)
+        kept = valid.clone()
+        clouds = points.detach().reshape(-1, *points.shape[-2:])
+        for cloud, rest in zip(clouds, kept.view(-1, kept.shape[-1]), strict=True):
+            if bool(rest.any()):
+                rest[rest.clone()] = ~split_support(cloud[rest]).mask
+        on_support = int(valid.sum() - kept.sum())
+        if on_support == 0 or split_support(sample_skin(shape, _FITTED.support_points).points).plane is not None:
+            return self
+        # From the caller of `align`.
+        warn_about_support(f"{on_support} of {int(valid.sum())} points of data", stacklevel=5)
+        return replace(self, mask=kept if self.mask is None else kept & self.mask.to(kept.device))
 
     def near(self, origin: Tensor) -> Observation:
         """Return the same in coordinates that begin at an origin (3,)."""
@@ -148,12 +176,14 @@ class Task:
     start: Tensor | None = None
     fit_shape: bool = False
     clothed: bool | str = False
+    support: str = "keep"
     on_step: OnStep | None = None
     seen: Observation = Observation(None, None)
 
     def observed(self, data: Any, mask: Tensor | None, keypoints: Any, keypoint_std: Tensor | float | None) -> Task:
         """Return the task with what is observed, in coordinates that begin near it, see `floating_origin`."""
-        seen = Observation.of(data, mask).with_keypoints(self.shape, keypoints, keypoint_std)
+        seen = Observation.of(data, mask).without_support(self.shape, self.support)
+        seen = seen.with_keypoints(self.shape, keypoints, keypoint_std)
         return to_local(replace(self, seen=seen), floating_origin(self.shape, seen.points))
 
     def near(self, origin: Tensor) -> Task:

@@ -17,6 +17,7 @@ from torchreg.cli.align_options import (
     Scale,
     Search,
     Sigma,
+    Support,
     Time,
     alignment_summary,
     cloud_files,
@@ -76,6 +77,7 @@ def align(
     outlier: Outlier = "limit",
     search: Search = "auto",
     nan_policy: NanPolicy = "raise",
+    support: Support = "auto",
     scale: Scale = 1.0,
     time: Time = None,
     frame: Frame = None,
@@ -116,6 +118,8 @@ def align(
         raise InputError(f"--rig has no meaning for {shape}, which is no rigged character; leave it out")
     if upright and start is not None:
         raise InputError("--upright is of a search, which --start leaves out; give one of them")
+    if views.depth and support != "auto":
+        raise InputError("--support is of clouds, and has no meaning with --depth; leave it out")
     pictures = views.source(clouds) if views.depth else None
     direction = known_up(up, clouds, camera=views.depth)
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
@@ -138,6 +142,7 @@ def align(
             options.load(shape_of_side(shape, side)), config,
             pictures.__getitem__ if pictures else lambda k: read_cloud(clouds[k], scale, nan_policy, time, frame),
             clouds, files, bar, fit_shape=fit_shape, rig=(shape, chosen_skin(options.skin)), up=direction,
+            support=support,
         )  # fmt: skip
         run.prepare(start, initializer, side, upright)
         run.known = known.read(run.shape, clouds, pictures, any_side=side == "either")
@@ -185,6 +190,7 @@ class _AlignRun:
     fit_shape: bool
     rig: tuple[str, str | int | None]
     up: Direction | None
+    support: str
     known: Known = field(default_factory=Known)
     initializer: PoseProposer | None = None
     start: Tensor | None = None
@@ -213,7 +219,9 @@ class _AlignRun:
         from torchreg.alignment.align import align
 
         data = self.read(0)
-        hand = better_hand(lambda hand: align(hand, data, self.start, config=self.config, **self.known.of(0)))
+        hand = better_hand(lambda hand: align(
+            hand, data, self.start, support=self.support, config=self.config, **self.known.of(0)
+        ))  # fmt: skip
         self.shape = hand
         self.skin = self._skin()
         if not self.bar.disable:
@@ -244,7 +252,8 @@ class _AlignRun:
         data = self.read(number)
         result = align(
             self.shape, data, self.start, model_points=None if self.fit_shape else self.skin, fit_shape=self.fit_shape,
-            initializer=self.initializer, config=self.config, on_step=self._show, **self.known.of(number),
+            initializer=self.initializer, support=self.support, config=self.config, on_step=self._show,
+            **self.known.of(number),
         )  # fmt: skip
         result = remembering(result, self.up)
         path, (picture, pose, ply, rig) = self.files.of(number)

@@ -38,7 +38,8 @@ def register(
         typer.Argument(
             metavar="SOURCE TARGET",
             help="Scan to be moved (.ply, .obj, .npz, ...), in any unit, and scan to be reached, in the same unit and "
-            "frame; or a folder or pattern of the two. With --urdf, any number of scans of one robot, in metres, in any order.",
+            "frame; or a folder or pattern of the two. With --urdf, any number of scans of one robot, in metres, in "
+            "any order.",
         ),
     ],
     output: Annotated[

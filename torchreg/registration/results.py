@@ -230,9 +230,10 @@ class SequenceRegistration(Result):
 
         Which points are one link, and whether two links turn about an axis, slide or hold together, is decided by how
         well their motions explain the scans, each parameter paying for itself; axes and joint values are then fitted to
-        all scans together, each compared with what the others show of the same link. The zero pose is the reference scan; each link has its triangles in PATH_meshes, beside the
-        file, or without triangles a closed surface about what all scans show of it. Limits are those of the motions
-        that were seen. Scans must be in metres. A joint that turns a round part about its own axis cannot be seen.
+        all scans together, each compared with what the others show of the same link. The zero pose is the reference
+        scan; each link has its triangles in PATH_meshes, beside the file, or without triangles a closed surface about
+        what all scans show of it. Limits are those of the motions that were seen. Scans must be in metres. A joint that
+        turns a round part about its own axis cannot be seen.
 
         Args:
             path: of the .urdf file.

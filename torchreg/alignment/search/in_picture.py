@@ -1,16 +1,20 @@
-"""A shape in a whole picture: the crops that may show it are tried, and the surest answer is kept."""
+"""A shape in a whole picture: the crops that may show it are tried, and the most probable answer is kept."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
+from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureAgreement
 from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import candidate_crops
 from torchreg.result import Status
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,36 @@ class Choice:
 
 CHOICE = Choice()
 Answer = TypeVar("Answer", AlignResult, PoseStarts)
+
+
+class Aligner(Protocol):
+    """What aligns a shape to a crop with given settings."""
+
+    def __call__(self, crop: DepthFrame, *, config: AlignConfig) -> AlignResult: ...  # noqa: D102
+
+
+def align_in_picture(
+    frame: DepthFrame,
+    skin: LinearBlendSkin,
+    aligned: Aligner,
+    config: AlignConfig,
+    crop_score: Callable[[DepthFrame], float],
+) -> AlignResult:
+    """Return the most probable alignment to crops of a frame, and its crop.
+
+    All crops are aligned without a search around the result; then the most probable one with it, if it is in doubt.
+    NOT_FOUND where even the most probable pose is hardly right.
+    """
+
+    def answer(settings: AlignConfig, crop: DepthFrame) -> AlignResult:
+        return judged(aligned(crop, config=settings), crop, skin)
+
+    quick = replace(config, search="never")
+    found, crop = surest_crop(frame, model_size(skin), lambda crop: answer(quick, crop), crop_score)
+    if _confidence(found) < CHOICE.sure and config.search != "never" and found.coefficients is None:
+        searched = answer(config, crop)
+        found = searched if _confidence(searched) > _confidence(found) else found
+    return replace(_not_found_if_improbable(found), crop=crop.mask)
 
 
 def surest_crop(
@@ -50,7 +84,21 @@ def surest_crop(
     return answer(everything), everything
 
 
-def not_found_if_improbable(found: AlignResult) -> AlignResult:
+def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin) -> AlignResult:
+    """Return the alignment to a crop of a picture, in doubt where `PICTURE_MODEL` says that something else is there."""
+    if found.shape is not None and found.coefficients is not None:
+        skin = sample_skin(found.shape)
+    there = float(PICTURE_MODEL.probability(PictureAgreement.of(skin, found.pose, crop).table()))
+    if there >= PICTURE_MODEL.against:
+        return found
+    reason = f"what the picture shows there looks like the shape with a probability of {there:.1%}"
+    status = Status.DOUBTFUL if found.statuses[0].usable else found.status
+    doubt = "; ".join(filter(None, (reason, str(found.doubt))))
+    assert found.confidence is not None
+    return replace(found, confidence=found.confidence.clamp_max(there), status=status, doubt=doubt)
+
+
+def _not_found_if_improbable(found: AlignResult) -> AlignResult:
     """Return the result of a whole picture, NOT_FOUND where even the most probable pose is hardly right."""
     confidence = _confidence(found)
     if found.statuses[0].usable or confidence >= CHOICE.not_found:

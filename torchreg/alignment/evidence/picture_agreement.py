@@ -1,0 +1,164 @@
+"""Whether a whole picture shows a posed shape: its visible surface, its normals, its relief; a learnt probability."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.fit.problem import AlignProblem, centered_problem
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.geometry.neighbors import k_nearest_others
+from torchreg.geometry.normals import fit_normals
+from torchreg.shapes.pose_algebra import shifted
+from torchreg.shapes.skin import LinearBlendSkin
+
+
+@dataclass(frozen=True)
+class _Look:
+    """How surfaces are compared; lengths are shares of the shape's size."""
+
+    on_shape: float = 0.03  # distance of data on the shape: a fit of another hand errs by .02
+    facing: float = 0.3  # cosine between a normal and the direction to the camera of a visible surface, at least
+    nearest_ray: float = 0.04  # first step towards the camera in which the shape may hide itself; each is twice as long
+    num_rays: int = 5
+    num_data: int = 800  # whose normals are compared
+    around: int = 16  # neighbors that give a normal
+    detail: float = 0.12  # radius within which normals are compared with their mean
+    neighbors: int = 24  # that give the mean
+    smoothest: float = 1.5  # logarithm of the shape's details over the data's: planes have none
+
+
+_LOOK = _Look()
+
+
+@dataclass(frozen=True)
+class PictureModel:
+    """The logistic model of whether a picture shows a shape about where a pose is: ``bias - sum_k weight_k e_k``.
+
+    That is the logarithm of the Bayes factor, the odds in favor where as many poses are as are not. ``e`` is the table
+    of `PictureAgreement`. Fitted by ``benchmarks/scenes.py --calibrate`` to 213 alignments in crops of made-up rooms,
+    of which 75 lie on a hand, also of other proportions and with things in it, or an arm.
+    """
+
+    bias: float = 5.16
+    weights: tuple[float, ...] = (0.86, 0.97, 4.59, 1.47, 1.74)  # as `PictureAgreement` has them
+    against: float = 0.24  # probability below which there is substantial evidence against, 1 / (1 + sqrt(10)): Jeffreys
+
+    def probability(self, agreement: Tensor) -> Tensor:
+        """Return the probability (...) that the shape is there, by agreements (..., E), at even odds before."""
+        return torch.sigmoid(self.bias - agreement @ agreement.new_tensor(self.weights))
+
+
+PICTURE_MODEL = PictureModel()
+
+
+@dataclass(frozen=True, eq=False)
+class PictureAgreement:
+    """How a whole picture speaks against a pose, () each: from 0 (agrees) to 1, and so on for `smooth`.
+
+    Args:
+        behind: share of the shape's visible surface through which the picture shows something farther.
+        normals: one less the mean cosine between the normals of data and shape.
+        relief: one less the correlation of the details of these normals: a ball has none.
+        smooth: logarithm of the shape's details over the data's, at least zero.
+        uncovered: share of the surface that a camera might see that the picture does not confirm.
+    """
+
+    behind: Tensor
+    normals: Tensor
+    relief: Tensor
+    smooth: Tensor
+    uncovered: Tensor
+
+    def table(self) -> Tensor:
+        """Return the numbers as (E,)."""
+        return torch.stack([getattr(self, item.name) for item in fields(self)])
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, skin: LinearBlendSkin, pose: Tensor, frame: DepthFrame) -> PictureAgreement:
+        """Return how a frame, a crop of the picture, agrees with a pose (num_dofs,) of a skin's shape."""
+        origin = frame.points.double().mean(0)
+        frame = frame.near(origin)
+        data, pose = frame.points[None].to(skin.points), shifted(pose[None].double(), -origin[None]).to(skin.points)
+        valid = torch.ones_like(data[..., 0], dtype=torch.bool)
+        problem = centered_problem(skin, data, valid, pose, data.new_zeros(1, 3), prior_std=None, pose_atol=0.0)
+        look = _Surface.of(problem, pose, frame)
+        normals, relief, smooth = _normal_agreement(problem, pose, frame)
+        return cls(
+            behind=look.share(look.gap > _LOOK.on_shape),
+            normals=1 - normals,
+            relief=1 - relief,
+            smooth=smooth.clamp(0, _LOOK.smoothest),
+            uncovered=1 - look.confirmed.sum() / look.visible.sum().clamp_min(1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Points (N,) of a posed skin: those visible, those of which a depth was measured, and how far behind it is.
+
+    `gap` is a share of the shape's size.
+    """
+
+    visible: Tensor
+    known: Tensor
+    gap: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> _Surface:
+        """Return what a picture shows where the surface of a pose (1, num_dofs) would be."""
+        posed = problem.skin(pose)
+        normal, posed = _shape_normals(problem, pose, posed)[0], posed[0]
+        toward = torch.nn.functional.normalize(frame.camera.position.to(posed) - posed, dim=-1)
+        steps = _LOOK.nearest_ray * 2.0 ** torch.arange(_LOOK.num_rays).to(posed)
+        rays = posed + problem.size * steps[:, None, None] * toward
+        clear = problem.surface.distance(rays.reshape(1, -1, 3), pose).reshape(len(rays), -1) > 0
+        visible = ((normal * toward).sum(-1) > _LOOK.facing) & clear.all(0)
+        pixels, depth = frame.camera.project(posed)
+        column, row = pixels.nan_to_num(-1).round().long().unbind(-1)
+        height, width = frame.depth.shape
+        framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        measured = frame.depth[row.clamp(0, height - 1), column.clamp(0, width - 1)].to(depth)
+        return cls(visible, visible & framed & (measured > 0), (measured - depth) / problem.size)
+
+    @property
+    def confirmed(self) -> Tensor:
+        """Which points lie where the picture has a surface, (N,)."""
+        return self.known & (self.gap.abs() <= _LOOK.on_shape)
+
+    def share(self, which: Tensor) -> Tensor:
+        """Return the share () of the measured points that are some (N,)."""
+        return ((which & self.known).sum() / self.known.sum().clamp_min(1)).to(self.gap)
+
+
+def _shape_normals(problem: AlignProblem, pose: Tensor, points: Tensor) -> Tensor:
+    """Return unit normals (1, N, 3) of the surface next to points (1, N, 3): the base's translation moves it so."""
+    slope = -problem.surface.distance_jacobian(points, pose)[1][..., :3]
+    return torch.nn.functional.normalize(slope, dim=-1)
+
+
+def _normal_agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean cosine between normals of data and shape, and the correlation and log ratio of their details.
+
+    Details are differences of normals from their mean nearby.
+    """
+    data = problem.data[0][problem.valid[0]]
+    data = data[problem.surface.distance(data[None], pose)[0].abs() < _LOOK.on_shape * problem.size]
+    if len(data) <= _LOOK.neighbors:
+        nothing = data.new_zeros(())
+        return nothing, nothing, nothing
+    stride = -(-len(data) // _LOOK.num_data)
+    normals = fit_normals(data.double(), k_nearest_others(data.double(), _LOOK.around)[0]).to(data)
+    data, normals = data[::stride], normals[::stride]
+    toward = frame.camera.position.to(data) - data
+    normals = torch.where((toward * normals).sum(-1, keepdim=True) < 0, -normals, normals)
+    expected = _shape_normals(problem, pose, data[None])[0]
+    index, apart = k_nearest_others(data, min(_LOOK.neighbors, len(data) - 1))
+    near = (apart < _LOOK.detail * problem.size).to(data).unsqueeze(-1)
+    measured, wanted = (n - (n + (n[index] * near).sum(1)) / (1 + near.sum(1)) for n in (normals, expected))
+    energy = [detail.square().sum().clamp_min(1e-9) for detail in (measured, wanted)]
+    relief = (measured * wanted).sum() / (energy[0] * energy[1]).sqrt()
+    return (normals * expected).sum(-1).mean(), relief, 0.5 * (energy[1] / energy[0]).log()
