@@ -138,7 +138,8 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: minus the log-odds that it is right, by which hypotheses are compared, see `ScanCalibration`.
+        energy: minus the log-odds that it is right, by which hypotheses are compared, see `ScanCalibration`; lower is
+            better.
         evidence: against it.
         deviation: mean squared distance of samples from where they were expected, capped at one; 0 if that is not
             known.

@@ -16,7 +16,7 @@ from torchreg.registration.dense.stages import deviations, mismatch, uncovered
 class ScanCalibration:
     """The logistic model of the confidence: log-odds of a right alignment, ``bias - sum_k weight_k evidence_k``.
 
-    By it hypotheses are compared, too: where points are expected, the prior odds are those of the deviation.
+    By it hypotheses are compared, too, with prior odds: by the deviation where points are expected, else by the turn.
 
     An alignment is right if 90 % of the points end within 2.5 % of the diagonal of the truth. Fitted to 90 pairs of the
     kinds that the matcher is trained on by ``benchmarks/scan_confidence.py --calibrate``.
@@ -25,6 +25,9 @@ class ScanCalibration:
     bias: float = 6.48
     weights: tuple[float, ...] = (5.31, 6.97, 5.71, 2.88, 4.85)  # in the order of `ScanEvidence`
     deviation: float = 6.0  # log-odds lost where all samples are far from where they are expected: as by residuals
+    turn: float = (
+        3.0  # log-odds lost by half a turn of the whole: one scan in twenty is turned by more than a right angle
+    )
     doubtful: float = 0.5  # confidence below which a result is doubtful
     recovery: float = 0.06  # probability that a frame reached from a wrong one is right: 4 of 64 in 26 sequences
 
@@ -44,10 +47,16 @@ def confidence_of(evidence: ScanEvidence) -> float:
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor) -> Hypothesis:
-    """Return how far motions (J, 4, 4) of the nodes can be trusted."""
+    """Return how far motions (J, 4, 4) of the nodes can be trusted.
+
+    The prior of turns R is a Fisher distribution about none, ``exp(c tr R / 4)``: without it a thing of which both ends
+    are alike could be turned end to end.
+    """
     evidence = scan_evidence(problem, transforms)
     deviation = float(deviations(problem, problem.graph(transforms)).mean())
-    return Hypothesis(name, SCAN_CALIBRATION.deviation * deviation - log_odds(evidence), evidence, deviation)
+    turn = float(3 - transforms.diagonal(dim1=1, dim2=2)[:, :3].sum(1).mean()) / 4
+    against = SCAN_CALIBRATION.turn * turn if problem.expected is None else SCAN_CALIBRATION.deviation * deviation
+    return Hypothesis(name, against - log_odds(evidence), evidence, deviation)
 
 
 def confidence_onward(before: float, confidence: float) -> float:
