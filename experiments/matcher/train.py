@@ -163,9 +163,10 @@ class _Run:
             self.best = {name: value.detach().clone() for name, value in self.net.state_dict().items()}
             self.best_right = right
         part = self.checkpoint.with_suffix(".part")
-        state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
-        state |= {"best": self.best, "best_right": self.best_right}
-        torch.save({**state, "step": self.step, "seconds": self.seconds}, part)
+        torch.save({
+            "net": self.net.state_dict(), "optimizer": self.optimizer.state_dict(), "step": self.step,
+            "seconds": self.seconds, "best": self.best, "best_right": self.best_right,
+        }, part)  # fmt: skip
         os.replace(part, self.checkpoint)
 
     @property
