@@ -24,10 +24,10 @@ from scan_matching import Pair, held_out, known, moved_points
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.made_up.matching_pairs import matching_pairs
-from torchreg.registration.dense.align_scans import align_problem, evidence_against
-from torchreg.registration.dense.config import ScanAlignConfig
+from torchreg.registration.dense.align_scans import align_problem
+from torchreg.registration.dense.config import ScanAlignConfig, ScanEvidence
 from torchreg.registration.dense.problem import describe
-from torchreg.registration.dense.reliability import ScanEvidence, confidence_of
+from torchreg.registration.dense.reliability import confidence_of
 
 NEAR, SHARE, FIFTHS = 0.025, 0.9, 5
 
@@ -50,7 +50,7 @@ def aligned(pairs: Iterable[Pair]) -> list[Case]:
         moved = moved_points(problem, candidates[0].transforms, pair.source)
         error = (moved - pair.truth).norm(dim=1) / pair.target.diagonal
         right = float((error < NEAR).double().mean()) >= SHARE
-        found.append(Case(right, evidence_against(problem, candidates[0])))
+        found.append(Case(right, candidates[0].hypothesis.evidence))
     return found
 
 

@@ -34,7 +34,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import torchreg as tr
 from experiments.made_up.creature_kinds import HELD_OUT_KINDS
 from experiments.made_up.matching_pairs import matching_pairs
-from experiments.matcher.rigs import body_of_rig
+from experiments.matcher.rigs import HELD_OUT_RIGS, body_of_rig
+from experiments.matcher.weights import load_weights
 from torchreg.registration.blend import blend_linear
 from torchreg.registration.dense.align_scans import align_problem
 from torchreg.registration.dense.config import ScanAlignConfig
@@ -50,8 +51,7 @@ RIGHT, VISIBLE = 0.05, 0.03
 SURE = 30.0
 
 
-# Kinds of rigs that are never trained on, and the mean motions of their points, in diagonals.
-RIG_KINDS = frozenset({"horse", "cattle", "shark", "frog", "insect", "hand", "vehicle", "monkey"})
+# Mean motions of the points of rigs, in diagonals.
 MOTION = (0.03, 0.15)
 # Pairs of a rig that are drawn until one moves as far as is wanted.
 TRIES = 60
@@ -148,13 +148,13 @@ def held_out(count: int) -> Iterator[Pair]:
 def rigs(folder: Path, count: int) -> Iterator[Pair]:
     """Yield so many pairs of the rigs of kinds that are never trained on, their mean motions spread evenly."""
     with (folder / "index.csv").open(encoding="utf-8", newline="") as index:
-        rows = [row for row in csv.DictReader(index) if row["kind"] in RIG_KINDS and row["torchreg"] == "ok"]
+        rows = [row for row in csv.DictReader(index) if row["kind"] in HELD_OUT_RIGS and row["torchreg"] == "ok"]
     for number, row in enumerate(rows * -(-count // len(rows))):
         if number == count:
             return
         low, high = (MOTION[0] + (MOTION[1] - MOTION[0]) * (number + end) / count for end in (0, 1))
-        body = {row["file"]: body_of_rig(folder / row["file"])}
-        stream = matching_pairs(2000 + number, bodies=body, body_share=1.0)
+        drawn = (row["kind"], body_of_rig(folder / row["file"]))
+        stream = matching_pairs(2000 + number, bodies=lambda _, drawn=drawn: drawn, body_share=1.0)
         for found in itertools.islice(stream, TRIES):
             moved = float((found.source_truth - found.source.points).norm(dim=1).mean()) / found.target.diagonal
             if low <= moved <= high:
@@ -178,13 +178,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder that holds range_pairs; skipped without")
     parser.add_argument("--pairs", type=int, default=20, help="of each kind never trained on")
-    parser.add_argument("--weights", type=Path, help="checkpoint of a training run, instead of the weights of torchreg")
+    parser.add_argument("--weights", type=Path, help="or checkpoint of a training run, instead of those of torchreg")
     parser.add_argument("--smoke", action="store_true", help="one pair of each kind")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     matcher = ScanMatcher()
     if options.weights is not None:
-        matcher.load_state_dict(torch.load(options.weights, weights_only=True)["net"])
+        matcher.load_state_dict(load_weights(options.weights))
     print(
         f"{'':10s} pairs  right  hidden recall, precision, break-even   error %  registered   of the truth: error %  "
         "registered   s"

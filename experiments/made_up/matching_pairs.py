@@ -39,6 +39,9 @@ class _Variety:
     symmetric: float = 0.05  # a joint has a partner where its place in the mirror is this near to it
     motion: tuple[float, float] = (6.0, 80.0)  # largest change of a joint from the first pose to the second, degrees
     largest_angle: float = 95.0  # of any joint, degrees
+    clip_share: float = 0.75  # of the pairs of a body with clips begin with a frame of one
+    clip_pose: float = 0.25  # of those end in a random pose near that frame, the others in a frame of any clip
+    same_clip: float = 0.5  # of the latter in a frame of the same clip
     distance: tuple[float, float] = (2.2, 6.0)  # of the camera, in radii of the creature
     camera_turn: tuple[float, float] = (8.0, 50.0)  # between both scans, in a third of the pairs, degrees
     scan_turn: float = 50.0  # of a scan in its own coordinates, in two fifths, degrees; any in a tenth
@@ -84,18 +87,20 @@ class PosableBody:
         figure: the surface and its parts.
         limits: (P,) largest angles of the joints, radians.
         rigid: whether its parts are rigid pieces.
+        clips: rotations (F, P, 3, 3) of the parts against their parents in the frames of each.
     """
 
     figure: Figure
     limits: Tensor
     rigid: bool = False
+    clips: tuple[Tensor, ...] = ()
 
 
 def matching_pairs(
     seed: int = 0,
     kinds: Mapping[str, tuple[Kind, float]] | None = None,
     *,
-    bodies: Mapping[str, PosableBody] | None = None,
+    bodies: Callable[[Draw], tuple[str, PosableBody]] | None = None,
     body_share: float = 0.4,
 ) -> Iterator[MatchingPair]:
     """Yield pairs of scans of creatures, each creature new at every few pairs, without end.
@@ -103,7 +108,7 @@ def matching_pairs(
     Args:
         seed: two streams of different seeds share nothing.
         kinds: what is drawn, with the share of each; `TRAINING_KINDS` by default.
-        bodies: further bodies, such as rigs of a user, each of them warped and scaled anew.
+        bodies: draws a further body, such as a rig of a user, and its kind; each is warped and scaled anew.
         body_share: of the pairs that show one of those.
 
     Cost: 0.3 s a pair.
@@ -112,9 +117,8 @@ def matching_pairs(
     kinds = TRAINING_KINDS if kinds is None else kinds
     names, shares = list(kinds), [share for _, share in kinds.values()]
     while True:
-        if bodies and draw.chance(body_share):
-            kind = list(bodies)[draw.count(0, len(bodies) - 1)]
-            body = bodies[kind]
+        if bodies is not None and draw.chance(body_share):
+            kind, body = bodies(draw)
         else:
             kind = names[int(torch.multinomial(torch.tensor(shares), 1, generator=draw.generator))]
             body = drawn_body(kinds[kind][0], draw)
@@ -196,30 +200,55 @@ def _pair(kind: str, body: PosableBody, draw: Draw) -> MatchingPair | None:
 
 
 def _two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMesh]:
-    """Return the surface in a random pose, and after a motion from a few degrees to wild."""
-    figure, count = body.figure, body.figure.num_parts
-
-    def angles(largest: float, active: float) -> Tensor:
-        axis = draw.normal(count, 3) * torch.tensor([2.0, 1.0, 1.0])  # mostly swings in the plane of the body
-        axis = torch.nn.functional.normalize(axis, dim=-1)
-        share = 2 * torch.rand(count, 1, generator=draw.generator, dtype=torch.float64) - 1
-        moving = torch.rand(count, 1, generator=draw.generator, dtype=torch.float64) < active
-        return axis * share * body.limits.clamp(max=math.radians(largest)).unsqueeze(-1) * moving
-
-    first = angles(draw.uniform(0, _VARIETY.first_pose), 0.8)
-    # As after half a step: left limbs are where right ones were.
-    start = _mirrored(first, body) if draw.chance(_VARIETY.half_step) else first
-    second = start + angles(draw.log_uniform(*_VARIETY.motion), draw.uniform(0.35, 1))
-    size = second.norm(dim=-1, keepdim=True)
-    second = second * (math.radians(_VARIETY.largest_angle) / size.clamp_min(1e-9)).clamp(max=1)
+    """Return the surface in two poses of clips, or in a random one and after a motion from a few degrees to wild."""
+    figure = body.figure
+    from_clips = bool(body.clips) and draw.chance(_VARIETY.clip_share)
+    rotations = _clip_rotations(body, draw) if from_clips else _random_rotations(body, draw)
     rests = [figure.mesh, figure.mesh]
     if not body.rigid and draw.chance(0.35):
         rests = [_folded(mesh, draw) for mesh in rests]
     posed = [
-        replace(figure, mesh=mesh).vertices(figure.transforms(so3_exp(turns)))
-        for mesh, turns in zip(rests, (first, second), strict=True)
+        replace(figure, mesh=mesh).vertices(figure.transforms(turns))
+        for mesh, turns in zip(rests, rotations, strict=True)
     ]
     return TriangleMesh(posed[0], figure.mesh.faces), TriangleMesh(posed[1], figure.mesh.faces)
+
+
+def _clip_rotations(body: PosableBody, draw: Draw) -> tuple[Tensor, Tensor]:
+    """Return rotations (P, 3, 3) of a frame of a clip and of another frame, of any clip, or of a pose near it."""
+    clip = body.clips[draw.count(0, len(body.clips) - 1)]
+    first = clip[draw.count(0, len(clip) - 1)]
+    if draw.chance(_VARIETY.clip_pose):
+        return first, first @ so3_exp(_motion(body, draw))
+    if not draw.chance(_VARIETY.same_clip):
+        clip = body.clips[draw.count(0, len(body.clips) - 1)]
+    return first, clip[draw.count(0, len(clip) - 1)]
+
+
+def _random_rotations(body: PosableBody, draw: Draw) -> tuple[Tensor, Tensor]:
+    """Return rotations (P, 3, 3) of two random poses."""
+    first = _angles(body, draw, draw.uniform(0, _VARIETY.first_pose), 0.8)
+    # As after half a step: left limbs are where right ones were.
+    start = _mirrored(first, body) if draw.chance(_VARIETY.half_step) else first
+    second = start + _motion(body, draw)
+    size = second.norm(dim=-1, keepdim=True)
+    second = second * (math.radians(_VARIETY.largest_angle) / size.clamp_min(1e-9)).clamp(max=1)
+    return so3_exp(first), so3_exp(second)
+
+
+def _motion(body: PosableBody, draw: Draw) -> Tensor:
+    """Return rotation vectors (P, 3) of a motion from a few degrees to wild."""
+    return _angles(body, draw, draw.log_uniform(*_VARIETY.motion), draw.uniform(0.35, 1))
+
+
+def _angles(body: PosableBody, draw: Draw, largest: float, active: float) -> Tensor:
+    """Return rotation vectors (P, 3) up to an angle, degrees, of a share of the joints."""
+    count = body.figure.num_parts
+    axis = draw.normal(count, 3) * torch.tensor([2.0, 1.0, 1.0])  # mostly swings in the plane of the body
+    axis = torch.nn.functional.normalize(axis, dim=-1)
+    share = 2 * torch.rand(count, 1, generator=draw.generator, dtype=torch.float64) - 1
+    moving = torch.rand(count, 1, generator=draw.generator, dtype=torch.float64) < active
+    return axis * share * body.limits.clamp(max=math.radians(largest)).unsqueeze(-1) * moving
 
 
 def _mirrored(turns: Tensor, body: PosableBody) -> Tensor:

@@ -17,11 +17,13 @@ from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 from ..made_up.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
 from ..made_up.creature_parts import Draw
 from ..made_up.matching_pairs import MatchingPair, matching_pairs
+from ..matcher.rigs import HELD_OUT_RIGS, drawn_bodies
 from ..matcher.rigs import people as drawn_people
-from ..matcher.rigs import rig_bodies
 
 # Pairs in a file: some 12 MB, and half a minute of one process to make.
 SHARD = 50
+# Share of the pairs that show rigs and people, not made-up kinds.
+_BODIES = 0.6
 # Steps of a geodesic distance as it is stored, in one byte.
 _LEVELS = 255 / SIZES.farthest
 
@@ -66,7 +68,7 @@ class PairBatch:
 
 def kind_names() -> list[str]:
     """Return the names of all kinds, by number; further bodies have the last."""
-    return [*TRAINING_KINDS, *HELD_OUT_KINDS, "body"]
+    return [*TRAINING_KINDS, *HELD_OUT_KINDS, *sorted(HELD_OUT_RIGS), "body"]
 
 
 def tokens_of_pair(pair: MatchingPair, generator: torch.Generator) -> PairBatch:
@@ -103,7 +105,7 @@ def make_shards(
         seed: of the stream.
         workers: processes that make them.
         held_out: of the kinds that are never trained on, instead of the others.
-        rigs: folder of rigs (glTF) that are drawn as well.
+        rigs: folder of rigs (glTF) that are drawn as well, see `drawn_bodies`.
         people: of the body model anny that are drawn as well, in each file.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -131,12 +133,9 @@ def _make_shard(job: tuple[Path, int, int, bool, Path | None, int]) -> None:
 
 
 def _stream(seed: int, held_out: bool, rigs: Path | None, people: int) -> Iterator[MatchingPair]:
-    if held_out:
-        return matching_pairs(seed, HELD_OUT_KINDS)
-    bodies = {} if rigs is None else dict(rig_bodies(rigs))
-    if people:
-        bodies |= drawn_people(Draw(torch.Generator().manual_seed(seed)), people)
-    return matching_pairs(seed, bodies=bodies)
+    drawn = drawn_people(Draw(torch.Generator().manual_seed(seed)), people) if people else []
+    bodies = drawn_bodies(rigs, drawn, held_out=held_out)
+    return matching_pairs(seed, HELD_OUT_KINDS if held_out else TRAINING_KINDS, bodies=bodies, body_share=_BODIES)
 
 
 def stacked(batches: list[PairBatch]) -> PairBatch:
@@ -167,12 +166,12 @@ class PairStore:
     """Pairs of files in memory, to be drawn in batches.
 
     Args:
-        files: made by `make_shards`.
+        files: made by `make_shards`; those that are not there are left out.
         device: where they are held, a quarter of a megabyte each, and given out.
     """
 
     def __init__(self, files: list[Path], device: str = "cpu") -> None:
-        shards = [torch.load(file, weights_only=True) for file in files]
+        shards = [torch.load(file, weights_only=True) for file in files if file.exists()]
         self._values = {name: torch.cat([shard[name] for shard in shards]).to(device) for name in shards[0]}
 
     def __len__(self) -> int:

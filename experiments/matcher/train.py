@@ -17,7 +17,8 @@ from torch import Tensor, distributed, nn
 
 from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities
 
-from ..matcher.shards import PairBatch, PairStore
+from ..matcher.shards import PairBatch, PairStore, kind_names
+from ..matcher.weights import load_weights
 
 # Width of the Gaussian about the true place, share of the target's size: half of what tokens are apart.
 _WIDTH = 0.025
@@ -120,7 +121,7 @@ def train(
     """Train a matcher, or go on where an earlier run in the same folder ended.
 
     Args:
-        files: of pairs to train on.
+        files: of pairs to train on; those that are still being made are read from the first pass after that.
         held_out: of pairs to validate with.
         output: folder of ``checkpoint.pt`` and ``curve.jsonl``.
         config: see `TrainConfig`.
@@ -145,20 +146,27 @@ class _Run:
         self.config, self.checkpoint = config, output / "checkpoint.pt"
         self.net = ScanMatcher(pretrained=False).to(config.device)
         self.step, self.seconds = 0, 0.0
+        self.best, self.best_right = self.net.state_dict(), -1.0
         if begin is not None and not self.checkpoint.exists():
-            self.net.load_state_dict(torch.load(begin, weights_only=True))
+            self.net.load_state_dict(load_weights(begin))
         self.optimizer = torch.optim.AdamW(self.net.parameters(), lr=config.rate, weight_decay=0.01)
         if self.checkpoint.exists():
             state = torch.load(self.checkpoint, weights_only=True, map_location=config.device)
             self.net.load_state_dict(state["net"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.seconds = state["step"], state["seconds"]
+            self.best, self.best_right = state["best"], state["best_right"]
 
-    def save(self) -> None:
-        """Write the checkpoint."""
+    def save(self, right: float) -> None:
+        """Write the checkpoint, with the weights that got most tokens of the held-out pairs right so far."""
+        if right > self.best_right:
+            self.best = {name: value.detach().clone() for name, value in self.net.state_dict().items()}
+            self.best_right = right
         part = self.checkpoint.with_suffix(".part")
-        state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
-        torch.save({**state, "step": self.step, "seconds": self.seconds}, part)
+        torch.save({
+            "net": self.net.state_dict(), "optimizer": self.optimizer.state_dict(), "step": self.step,
+            "seconds": self.seconds, "best": self.best, "best_right": self.best_right,
+        }, part)  # fmt: skip
         os.replace(part, self.checkpoint)
 
     @property
@@ -187,7 +195,8 @@ def _work(
         distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=config.processes)
     run = _Run(output, config, begin)
     # Every process holds its own share of the pairs.
-    pairs = PairStore(files[rank :: config.processes], config.device)
+    own = files[rank :: config.processes]
+    pairs = PairStore(own, config.device)
     others = PairStore(held_out, config.device) if rank == 0 else None
     generator = torch.Generator().manual_seed(config.seed + 1000 * rank + run.step)
     order, losses = torch.empty(0, dtype=torch.int64), []
@@ -195,6 +204,7 @@ def _work(
     while True:
         begun = time.monotonic()
         if len(order) < count:
+            pairs = PairStore(own, config.device)
             order = torch.randperm(len(pairs), generator=generator)
         rows, order = order[:count], order[count:]
         losses.append(_step(run, pairs.batch(rows, torch.rand(count, generator=generator) < 0.5)))
@@ -238,12 +248,14 @@ def _agreed(seconds: float, meeting: str | None) -> float:
 
 def _report(run: _Run, pairs: PairStore, loss: float, output: Path) -> None:
     """Validate, print and keep a row of the curve, and write the checkpoint."""
-    scores = validate(run.net, pairs, run.config.device)[-1]
+    found, names = validate(run.net, pairs, run.config.device), kind_names()
+    scores = found.pop(-1)
     row: dict[str, Any] = {"step": run.step, "seconds": round(run.seconds), "train_loss": loss, **asdict(scores)}
+    row["right_by_kind"] = {names[kind]: round(of.right, 3) for kind, of in found.items()}
     with (output / "curve.jsonl").open("a", encoding="utf-8") as curve:
         curve.write(json.dumps(row) + "\n")
     typer.echo(
         f"step {run.step}  {run.seconds / 60:.1f} min  loss {loss:.3f}  held out: loss {scores.loss:.3f}, "
         f"right {scores.right:.3f}, hidden found {scores.recall:.2f}, rightly {scores.precision:.2f}"
     )
-    run.save()
+    run.save(scores.right)

@@ -218,8 +218,9 @@ def test_the_truth_of_pairs_lies_on_the_other_scan_where_it_is_visible_and_leads
         back = (pair.target_truth[nearest] - pair.source.points[pair.source_visible]).norm(dim=-1)
         assert float(back.median()) < 0.02 * pair.source.diagonal
     limits = torch.tensor(TRAINING_KINDS["snake"][0](Draw(seeded(1))).limits, dtype=torch.float64)
-    mine = {"mine": PosableBody(creature("snake"), limits)}
-    assert {pair.kind for pair in itertools.islice(matching_pairs(2, bodies=mine, body_share=1.0), 2)} == {"mine"}
+    mine = ("mine", PosableBody(creature("snake"), limits))
+    found = matching_pairs(2, bodies=lambda _: mine, body_share=1.0)
+    assert {pair.kind for pair in itertools.islice(found, 2)} == {"mine"}
 
 
 def test_a_shape_bends_and_turns_before_one_camera():

@@ -1,5 +1,6 @@
 """Problems of two scans: what they hold, how motions are judged, fused from several and trusted."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,8 +12,7 @@ from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.fusion import fuse_motions
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.problem import ExpectedPlaces, describe
-from torchreg.registration.dense.reliability import scan_evidence
-from torchreg.registration.dense.stages import judge
+from torchreg.registration.dense.reliability import SCAN_CALIBRATION, confidence_of, judge
 
 
 def test_samples_are_normalized_and_belong_to_the_scans(pair, problem):
@@ -48,17 +48,26 @@ def test_judged_are_distances_both_ways_what_the_graph_bends_and_leaps(problem, 
     motions[..., 2, 3] += shift
     moved, prior = problem.moved(motions).points, problem.prior
     found = judge(problem, "some", motions)
-    assert found.forward == pytest.approx(capped(prior.visible[:400], moved, problem.target.points, quick.cap))
-    assert found.backward == pytest.approx(capped(prior.target_visible, problem.target.points, moved, quick.cap))
-    assert found.smoothness == pytest.approx(quick.smoothness * float(problem.graph.smoothness(motions)))
+    evidence, visible, shown = found.evidence, prior.visible[:400], prior.target_visible
+    costs = (
+        capped(visible, moved, problem.target.points, quick.cap),
+        capped(shown, problem.target.points, moved, quick.cap),
+    )
+    for cost, of, seen in zip(costs, (evidence.forward, evidence.backward), (visible, shown), strict=True):
+        assert of == pytest.approx(cost / float(seen.mean()))
+    assert evidence.smoothness == pytest.approx(quick.smoothness * float(problem.graph.smoothness(motions)))
+    nearest = torch.cdist(moved, problem.target.points).argmin(1)
+    support = prior.logarithm(nearest[:, None], quick.doubt)[:, 0]
+    assert evidence.unsupported == pytest.approx(-float((visible * support).sum() / visible.sum()))
+    assert evidence.hidden == pytest.approx(1 - float(visible.mean()))
     assert (found.name, found.deviation) == ("some", 0)
-    assert found.energy == pytest.approx(found.forward + found.backward + found.smoothness)
+    assert confidence_of(evidence) == pytest.approx(1 - 1 / (1 + math.exp(-found.energy)))
     # A leap costs its squared distance in three stds, at most one.
     for distance, cost in ((0.0, 0.0), (0.015, 0.25), (0.03, 1.0), (7.0, 1.0)):
         away = ExpectedPlaces(moved + distance * torch.tensor([0.6, 0.0, -0.8]).double(), 0.01)
         leap = judge(replace(problem, expected=away), "", motions)
         assert leap.deviation == pytest.approx(cost, rel=1e-6)
-        assert leap.energy == pytest.approx(found.energy + cost)
+        assert leap.energy == pytest.approx(found.energy + SCAN_CALIBRATION.deviation * cost)
 
 
 @pytest.fixture(scope="module")
@@ -93,15 +102,3 @@ def test_alignments_of_one_thing_are_trusted_and_of_two_are_not(pair, aligned, s
     assert 0.7 < aligned.confidence < 1
     lifted = pair.target.shifted(torch.tensor([0.0, 0.0, 0.1]) * pair.source.diagonal)
     assert align_scans(pair.source, lifted, quick).confidence == pytest.approx(aligned.confidence, abs=0.2)
-
-
-def test_evidence_is_what_is_judged_of_visible_points_and_their_support(problem, quick):
-    motions, prior = problem.graph.rest(), problem.prior
-    motions[:, 0, 3] += 0.02
-    judged, found = judge(problem, "some", motions), scan_evidence(problem, motions, 0.3)
-    assert found.forward == pytest.approx(judged.forward / float(prior.visible[:400].mean()))
-    assert found.backward == pytest.approx(judged.backward / float(prior.target_visible.mean()))
-    nearest = torch.cdist(problem.moved(motions).points, problem.target.points).argmin(1)
-    support = prior.logarithm(nearest[:, None], quick.doubt)[:, 0]
-    assert found.unsupported == pytest.approx(-float((prior.visible * support).sum() / prior.visible.sum()))
-    assert (found.hidden, found.smoothness) == (pytest.approx(1 - float(prior.visible.mean())), 0.3)

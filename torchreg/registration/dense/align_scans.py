@@ -27,14 +27,8 @@ from torchreg.registration.dense.fusion import fuse_motions
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.node_graph import spread_weights
 from torchreg.registration.dense.problem import NORMAL_SCALE, ExpectedPlaces, ScanAlignProblem, describe
-from torchreg.registration.dense.reliability import ScanEvidence, confidence_of, scan_evidence
-from torchreg.registration.dense.stages import (
-    Reporter,
-    agree,
-    judge,
-    refine,
-    soft_matches,
-)
+from torchreg.registration.dense.reliability import confidence_of, judge
+from torchreg.registration.dense.stages import Reporter, agree, refine, soft_matches
 
 _One = TypeVar("_One")
 _Other = TypeVar("_Other")
@@ -59,10 +53,10 @@ def align_scans(
     from rest; from where points are expected, if that is known, and there samples that the matcher calls hidden are
     held; and from the matcher's matches, to which a stiff graph is fitted by an EM in which they are the prior, see
     `fit_coarsely`. Each goes on by an EM with an outlier class, hidden samples by the matcher's probability, in which
-    its matches still are the prior, less and less, while edges of the graph count robustly. Unless the two best agree,
+    its matches still are the prior, while edges of the graph count robustly. Unless the two best agree,
     each part then moves as in the hypothesis that suits it, and the EM goes on from there as well.
-    The best covers the target, is covered by it, as far as each shows the other, deforms most smoothly, and is nearest
-    to what is expected.
+    The best is the one that is right with the largest probability, by a learnt model: it covers the target, is covered
+    by it, as far as each shows the other, deforms smoothly, has the matcher's support, and is near to what is expected.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -97,7 +91,7 @@ def align_scans(
     moved = blend_linear(problem.unit.normalize(source.points), weights, transforms)
     return ScanAlignment(
         points=problem.unit.denormalize(moved, source.points),
-        confidence=confidence_of(evidence_against(problem, found[0])),
+        confidence=confidence_of(hypotheses[0].evidence),
         point_confidence=_point_confidence(problem, transforms, source.points).to(source.points),
         samples=problem.samples,
         nodes=problem.nodes,
@@ -123,11 +117,6 @@ def align_problem(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]
     if not agree(problem, found[0].transforms, found[1].transforms):
         found = sorted([*found, _fused(problem, found, on_step)], key=_energy)
     return found
-
-
-def evidence_against(problem: ScanAlignProblem, best: Candidate) -> ScanEvidence:
-    """Return the evidence vector of a candidate."""
-    return scan_evidence(problem, best.transforms, best.hypothesis.smoothness)
 
 
 def _candidates(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:

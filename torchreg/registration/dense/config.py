@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
@@ -109,24 +110,44 @@ OnStep = Callable[[ScanAlignRecord], None]
 
 
 @dataclass(frozen=True)
+class ScanEvidence:
+    """Evidence against an alignment.
+
+    Args:
+        forward: mean cost of moved samples that the matcher calls visible, see `mismatch`.
+        backward: mean squared distance of visible target samples from the moved source, in caps, capped at one.
+        smoothness: weighted disagreement of neighboring nodes of the graph.
+        unsupported: mean of minus the logarithm of the matcher's support of where visible samples ended.
+        hidden: share of samples that the matcher calls hidden.
+    """
+
+    forward: float
+    backward: float
+    smoothness: float
+    unsupported: float
+    hidden: float
+
+    def table(self) -> Tensor:
+        """Return the numbers (E,), float64."""
+        return torch.tensor([getattr(self, item.name) for item in fields(self)], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
 class Hypothesis:
     """One way in which the source may have moved.
 
     Args:
         name: what it started from.
-        energy: ``forward + backward + smoothness + deviation``, by which hypotheses are compared; lower is better.
-        forward: mean squared distance of moved samples to the target, capped at one, if visible there.
-        backward: mean squared distance of target samples to the moved source, capped at one, if visible there.
-        smoothness: weighted disagreement of neighboring nodes.
+        energy: minus the log-odds that it is right, by which hypotheses are compared, see `ScanCalibration`; lower is
+            better.
+        evidence: against it.
         deviation: mean squared distance of samples from where they were expected, capped at one; 0 if that is not
             known.
     """
 
     name: str
     energy: float
-    forward: float
-    backward: float
-    smoothness: float
+    evidence: ScanEvidence
     deviation: float = 0.0
 
 

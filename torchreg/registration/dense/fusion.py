@@ -24,8 +24,9 @@ _LEAST_GAIN = 1e-4
 def fuse_motions(problem: ScanAlignProblem, options: Tensor) -> Tensor:
     """Return motions of the nodes, each as in one of several hypotheses.
 
-    The energy is that by which hypotheses are compared, every sample moved by the node that it hangs on most. Starting
-    from the first hypothesis, the patch and hypothesis that lower it most change hands, until none does.
+    The energy is what samples of both scans are off, what the graph bends and how far samples are from where they are
+    expected, every sample moved by the node that it hangs on most. Starting from the first hypothesis, the patch and
+    hypothesis that lower it most change hands, until none does.
 
     References: Lempitsky, Rother, Roth, Blake 2010, on fusing proposals into one labeling.
     """

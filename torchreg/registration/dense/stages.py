@@ -1,4 +1,4 @@
-"""The EM that fits a deformation graph to a target, and the energy by which results are compared."""
+"""The EM that fits a deformation graph to a target, and how far results are from it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.registration.annealing import geometric_at
-from torchreg.registration.dense.config import Hypothesis, OnStep, ScanAlignRecord
+from torchreg.registration.dense.config import OnStep, ScanAlignRecord
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
 from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph
 from torchreg.registration.dense.oriented_samples import OrientedSamples
@@ -59,7 +59,7 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
         share = step / max(plan.num_steps - 1, 1)
         sigma, stiffness = geometric_at(plan.sigma, share), geometric_at(plan.stiffness, share)
         moved = problem.moved(transforms)
-        found = soft_matches(problem, moved, sigma, share)
+        found = soft_matches(problem, moved, sigma)
         matches = GraphMatches(
             slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
         )
@@ -70,28 +70,14 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
     return transforms
 
 
-def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, share: float = 1.0) -> SoftMatches:
-    """Return the matches of an E-step, a share of the way through, of moved samples.
-
-    The matcher is doubted ever more: sigma falls far below what its tokens are apart. What it calls hidden stays so.
-    """
+def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float) -> SoftMatches:
+    """Return the matches of an E-step of moved samples, in which the matcher's are the prior."""
     config = problem.config
     return match_softly(
         moved, problem.target, sigma, normal_weight=config.normal_weight, outliers=config.outliers,
         visible=problem.prior.visible[: len(moved)],
-        prior=problem.prior, doubt=geometric_at((config.doubt, 1.0), share),
+        prior=problem.prior, doubt=config.doubt,
     )  # fmt: skip
-
-
-def judge(problem: ScanAlignProblem, name: str, transforms: Tensor) -> Hypothesis:
-    """Return how well moved source and target cover each other, and how smooth it is."""
-    moved = problem.moved(transforms)
-    forward = float(mismatch(problem, moved)[0].mean())
-    backward = float(uncovered(problem, moved).mean())
-    smoothness = problem.config.smoothness * float(problem.graph.smoothness(transforms))
-    deviation = float(deviations(problem, moved.points).mean())
-    costs = (forward, backward, smoothness, deviation)
-    return Hypothesis(name, sum(costs), *costs)
 
 
 def deviations(problem: ScanAlignProblem, places: Tensor) -> Tensor:
