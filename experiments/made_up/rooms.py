@@ -284,8 +284,7 @@ def arm_scene(seed: int, there: bool) -> Scene:
 
 def posed_mesh(skin: LinearBlendSkin, pose: Tensor) -> TriangleMesh:
     """Return the surface of a skin with triangles in a pose (num_dofs,)."""
-    assert skin.faces is not None
-    return TriangleMesh(skin(pose).detach(), skin.faces)
+    return TriangleMesh(skin(pose).detach(), torch.as_tensor(skin.faces))
 
 
 def held_scene(seed: int, there: bool) -> Scene:

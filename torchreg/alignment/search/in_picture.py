@@ -94,8 +94,7 @@ def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin) -> Align
     reason = f"what the picture shows there looks like the shape with a probability of {there:.1%}"
     status = Status.DOUBTFUL if found.statuses[0].usable else found.status
     doubt = "; ".join(filter(None, (reason, str(found.doubt))))
-    assert found.confidence is not None
-    return replace(found, confidence=found.confidence.clamp_max(there), status=status, doubt=doubt)
+    return replace(found, confidence=found.pose.new_tensor(min(_confidence(found), there)), status=status, doubt=doubt)
 
 
 def _not_found_if_improbable(found: AlignResult) -> AlignResult:
