@@ -22,6 +22,7 @@ import hashlib
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -164,12 +165,12 @@ def outcome(found: Break, copy: Path, limit: float) -> str:
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     try:
         broken.write_text(found.applied(whole))
-        with subprocess.Popen(command, cwd=copy, env=environment, **quiet) as tests:
+        with subprocess.Popen(command, cwd=copy, env=environment, start_new_session=True, **quiet) as tests:
             resource.prlimit(tests.pid, resource.RLIMIT_CPU, (round(limit), round(limit) + 1))
             try:
                 code = tests.wait(20 * limit)  # something may wait for ever
             except subprocess.TimeoutExpired:
-                tests.kill()
+                os.killpg(tests.pid, signal.SIGKILL)
                 code = -1
     finally:
         broken.write_text(whole)
