@@ -1,6 +1,7 @@
 """How far alignments can be trusted: covariance, convergence, confidence, and doubts in words."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -165,3 +166,18 @@ def test_the_more_fingers_are_without_data_the_lower_is_the_confidence(plain_han
     assert float(tight.confidence) > float(found.confidence[3])
     alone = tr.align(plain_hand, clouds[3], pose, mask=mask[3], model_points=plain_hand_skin, config=DESCENT)
     assert float(alone.confidence) == pytest.approx(float(found.confidence[3]), abs=0.02)
+
+
+def test_hidden_ends_spread_as_the_prior_does():
+    """One hinge without data: its end lies within 4 % of the size as often as in draws from the prior."""
+    joints = [joint("body", -1), joint("arm", 0, (0, 0, 0), "revolute", (1.0, 0.0, 0.0), -1.5, 1.5)]
+    solids = [solid("ellipsoid", (0.05, 0.03, 0.06)), solid("ellipsoid", (0.01, 0.01, 0.05), 0, 0, 0.15)]
+    shape = shape_of(joints, solids, nu=0.004)
+    skin, pose = tr.sample_skin(shape, 300), shape.rest_pose()
+    size, lever = (skin.points.amax(0) - skin.points.amin(0)).norm(), skin.points[:, 1:].norm(dim=-1).max()
+    body, sources = skin(pose)[skin.weights.argmax(-1) == 0], [lambda *_: pose[None, None]]
+    for std in (0.03, 0.05):
+        config = tr.FindPoseConfig(num_candidates=1, num_placed=1, num_searched=1, prior_std=std)
+        found = tr.find_pose(shape, body, sources=sources, model_points=skin, locked="base", config=config)
+        expected = 1 - math.exp(-(float(0.04 * size / (lever * std)) ** 2))
+        assert float(found.confidence) == pytest.approx(expected, rel=0.1)
