@@ -4,28 +4,40 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import warn_about_rounding
-from torchreg.alignment.assembly import assembled
 from torchreg.alignment.evidence.curvature import curvature
-from torchreg.alignment.evidence.reliability import SurfaceError, without_cut
+from torchreg.alignment.evidence.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
-from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal
-from torchreg.alignment.fit.problem import AlignProblem, alignment_cost, centered_problem, masked_mean
+from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal, outlier_level
+from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, masked_mean
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
-from torchreg.alignment.inputs import Task, check_clouds, warn_about_units
+from torchreg.alignment.inputs import Task, check_clouds, warn_about_degenerate, warn_about_units
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.search.local_search import explore, needs_search
+from torchreg.alignment.search.multi_start import mean_distances
 from torchreg.errors import InputError, UnitsWarning
-from torchreg.result import normal_copy
+from torchreg.geometry.budget import BUDGET
+from torchreg.result import Status, normal_copy
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.solvers.e_step import expectation
 
+
+@dataclass(frozen=True)
+class _Limits:
+    """When a pose means nothing."""
+
+    min_inliers: int = 10  # with fewer
+    min_share: float = 0.02  # the same, as a share of the data
+
+
+_LIMITS = _Limits()
 # Poses of a search, of which rivals are told: a box looks alike from as many sides.
 _NUM_STARTS = 4
 
@@ -154,8 +166,40 @@ class PoseRows:
         return rows._joined(index, more)
 
     def judged(self, error: SurfaceError | None = None) -> AlignResult:
-        """Return the result, see `assembled`: inliers by eq. 2, the posterior by eq. 17."""
-        return normal_copy(assembled(self, error))
+        """Return the result, with what speaks against it; ``error`` is that of a person's surface."""
+        problem, pose, config, seen = self.problem, self.found.pose, self.task.config, self.task.seen
+        rivals = None if self.rivals is None else _different(self, self.rivals)
+        fitted = DataOnShape.of(self, problem.data, problem.valid)
+        everything = fitted if seen.everything is None else DataOnShape.of_all(self, *seen.everything)
+        cost = alignment_cost(problem, pose, torch.where(problem.valid, fitted.distances, 0.0))
+        inliers, world = fitted.inliers, shifted(pose, self.origin)
+        # What lies off the surface tells nothing of the pose, unless all does.
+        told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
+        degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=4)
+        judgement = judge(self.uncropped, pose, self.lead, error, seen.frames, rivals)
+        confidence = torch.where(degenerate, 0.0, judgement.confidence)
+        converged = self.found.change <= config.pose_atol
+        converged = converged | judgement.converged if config.surface_steps or error is not None else converged
+        states = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
+        result = AlignResult(
+            pose=world,
+            registered=problem.skin(pose) + self.origin.unsqueeze(1),
+            keypoints=problem.skin.shape.keypoints(world),
+            distances=everything.distances,
+            inliers=everything.inliers,
+            posterior=everything.posterior,
+            sigma=self.found.sigma,
+            cost=cost,
+            status=tuple(_status(*row) for row in zip(*(row.tolist() for row in states), strict=True)),
+            history=tuple(self.history),
+            covariance=judgement.covariance,
+            dof_confidence=judgement.dof_confidence,
+            confidence=confidence,
+            evidence=judgement.evidence.table(),
+            doubt=judgement.doubt,
+            rivals=rivals,
+        )
+        return normal_copy(result if self.batched else _unbatched(result))
 
     def _refitted(
         self,
@@ -192,3 +236,68 @@ def _search(task: Task) -> FoundStarts:
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
         config = FindPoseConfig(num_model_points=points, nan_policy=policy, seed=seed)
         return search_everywhere(task, _NUM_STARTS, config)
+
+
+def _different(rows: PoseRows, rivals: Tensor) -> Tensor:
+    """Return rivals (B, R, num_dofs), NaN where they are as right as the poses (B, num_dofs) found."""
+    local = torch.cat([rows.found.pose.unsqueeze(1), shifted(rivals, -rows.origin.unsqueeze(1))], dim=1)
+    apart = mean_distances(rows.problem, local)[:, 0, 1:] > CALIBRATION.right * rows.problem.size
+    return torch.where(apart.unsqueeze(-1), rivals, torch.nan)
+
+
+def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, confidence: float) -> Status:
+    if num_data == 0:
+        return Status.NO_DATA
+    if degenerate:
+        return Status.DEGENERATE
+    if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
+        return Status.FEW_INLIERS
+    if confidence < CALIBRATION.doubtful:
+        return Status.DOUBTFUL
+    return Status.CONVERGED if converged else Status.MAX_STEPS
+
+
+def _unbatched(result: AlignResult) -> AlignResult:
+    """Return the result of the single problem of a batch."""
+    first = {
+        item.name: getattr(result, item.name)[0]
+        for item in fields(result)
+        if item.name not in ("history", "origin", "shape") and getattr(result, item.name) is not None
+    }
+    rivals = first.get("rivals")
+    if rivals is not None:
+        first["rivals"] = rivals[rivals.isfinite().all(-1)]
+    return replace(result, **first)
+
+
+@dataclass(frozen=True, eq=False)
+class DataOnShape:
+    """How data lie on a shape, (B, M) each, see `AlignResult`."""
+
+    distances: Tensor
+    inliers: Tensor
+    posterior: Tensor
+
+    @classmethod
+    def of(cls, rows: PoseRows, data: Tensor, valid: Tensor) -> DataOnShape:
+        """Return how data (B, M, 3), in the coordinates of the problem, lie on the shape found."""
+        problem, found = rows.problem, rows.found
+        posed = problem.skin(found.pose)
+        outlier = outlier_level(problem, posed, found.sigma)
+        distances = torch.where(valid, problem.surface.distance(data, found.pose), torch.nan)
+        return cls(
+            distances=distances,
+            inliers=distances.abs() < (rows.task.config.inlier_distance or INLIER_SHARE * problem.size),
+            posterior=expectation(posed, data, found.sigma, outlier, mask=valid).inlier_posterior,
+        )
+
+    @classmethod
+    def of_all(cls, rows: PoseRows, clouds: Tensor, valid: Tensor) -> DataOnShape:
+        """Return the same for whole clouds ((B,) M, 3), in the world, of which the problem's data are a draw."""
+        count = len(rows.found.pose)
+        clouds, valid = clouds.expand(count, *clouds.shape[-2:]), valid.expand(count, valid.shape[-1])
+        size, parts = max(1, BUDGET.field_points // count), []
+        for points, chosen in zip(clouds.split(size, 1), valid.split(size, 1), strict=True):
+            local = torch.where(chosen.unsqueeze(-1), points - rows.origin.unsqueeze(1), 0.0)
+            parts.append(cls.of(rows, local, chosen))
+        return cls(*(torch.cat([getattr(part, item.name) for part in parts], 1) for item in fields(cls)))
