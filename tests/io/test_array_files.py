@@ -134,7 +134,7 @@ def test_zip_bombs_and_odd_archives_are_refused_before_expanding(tmp_path):
             lambda: read(tmp_path, "a.npz", zipped({"a": b"1"}, zipfile.ZIP_BZIP2)),
             "is packed by method 12; use deflate",
         ),
-        (lambda: read(tmp_path, "a.npz", bytes(encrypted)), "'points.npy' is encrypted"),
+        (lambda: read(tmp_path, "a.npz", bytes(encrypted)), "is encrypted; save the archive without a password"),
     )
 
 
