@@ -192,12 +192,15 @@ def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of
 
 @each_row(
     (("none.ply",), "none.ply: No such file or directory"),
+    (("--start", "none.json"), "none.json: No such file or directory"),
     (("--start", "list.json"), "list.json must have shape (27)"),
     (("--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
+    (("--sigma", "a:b:c"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
     (("--sigma", "0.01:0.02:5"), "stop must not exceed start"),
     (("--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
     (("--scale", "0"), "--scale must be positive and finite, got 0.0"),
     (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand; leave it out"),
+    (("--parents", "list.json"), "--parents has no meaning for hand"),
     (("-o", "no/r.x"), "no does not exist; create it first"),
     (("--picture", "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
     (("--pose", "r.json"), "two outputs would be called"),

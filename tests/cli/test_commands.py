@@ -105,6 +105,8 @@ def test_what_writes_names_its_output_and_help_is_in_sentences_with_two_right_ex
 
 @each_row(
     (("register", "a", "b", "--num-bones", "3"), "No such option: --num-bones; did you mean --bones?"),
+    (("spine", "a", "--num-tips=5"), "No such option: --num-tips; did you mean --tips?"),
+    (("align", "hand", "a", "--serch", "never"), "No such option: --serch; did you mean --search?"),
     (("align", "hand", "a", "--gif", "a.gif"), "No such option: --gif; torchreg export writes it from the result"),
     (("spine", "a", "--seed", "3"), "it gives the same result every time"),
     (("info", "hand", "--qqqq"), "No such option: --qqqq; --help shows all"),
@@ -140,6 +142,7 @@ def test_hints_are_options_of_the_command_or_left_out(error_of, monkeypatch, mes
 @each_row(
     (tr.errors.InputError("sigma must be\n  positive"), 2, "torchreg: sigma must be positive\n"),
     (FileNotFoundError(2, "No such file or directory", "a.ply"), 2, "torchreg: a.ply: No such file or directory\n"),
+    (FileNotFoundError("the folder does not exist"), 2, "torchreg: the folder does not exist\n"),
     (KeyboardInterrupt(), 130, "torchreg: interrupted\n"),
     (ZeroDivisionError("a mistake"), 1, ""),  # the program's own keep their traceback
     (BrokenPipeError(32, "Broken pipe"), 1, ""),
@@ -268,15 +271,19 @@ def test_people_have_names(run, interrupted):
 
 @each_row(
     (["Hand"], "did you mean 'hand'?"),
+    (["hand-right"], "did you mean 'hand'?"),
     (["left-hand"], "did you mean 'hand-left'?"),
     (["mano_right.pkl"], "from_skinned_mesh"),
     (["robot.xacro"], "URDF"),
     (["foot"], "SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf"),
+    (["scan.ply"], "SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf"),
     (["hand", "--fixed-base"], "--free-base/--fixed-base has no meaning for hand; leave it out"),
+    (["hand-left", "--package-dir", "."], "--package-dir has no meaning for hand-left"),
     (["arm.urdf", "--parents", "a.json"], "--parents has no meaning for "),
     (["flat.glb", "--free-base"], "--free-base/--fixed-base has no meaning for "),
     (["flat.glb", "--parents", "{"], "cannot be read as JSON"),
     (["flat.glb", "--parents", "[" * 100_000], "cannot be read as JSON"),
+    (["flat.glb", "--parents", "[1]"], "must hold {joint: parent or null}"),
     (["flat.glb", "--parents", '{"root": 1}'], "must hold {joint: parent or null}"),
 )
 def test_wrong_shapes_are_answered_with_what_there_is(error_of, folder, tmp_path, words, message):

@@ -344,16 +344,21 @@ def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
 
 @each_row(
     ({"frames": ["none.ply"]}, "none.ply: No such file or directory"),
+    ({"frames": ["start.json"]}, "has the unknown ending '.json'"),
+    (("--start", "none.json"), "none.json: No such file or directory"),
     (("--movie", "avi"), "--movie must be one of gif, mp4, none; got 'avi'"),
     (("--fps", 0), "--fps must be positive"),
     (("--scale", -1), "--scale must be positive"),
     (("--prediction", "maybe"), "prediction must be one of velocity, none"),
+    (("--model-points", "few"), "model_points must be one of seen, data, shape"),
+    (("--nan-policy", "keep"), "nan_policy must be one of raise, omit"),
     (("--points", 0), "num_model_points must be at least 1"),
     (("--fixed-base",), "--free-base/--fixed-base has no meaning for hand"),
     (("--gltf", "a.glb", "--no-gltf"), "--gltf and --no-gltf cannot be used together"),
     (("--poses", "a.txt"), "a.txt must end in .csv"),
     (("--reach", 0.1), "--reach has no meaning without --stereo"),
     (("--depth-range", 1, 2), "--depth-range has no meaning without --stereo or --depth"),
+    (("--depth",), "--depth takes --intrinsics FILE with the camera"),
     ({"out": "no/r"}, "no does not exist; create it first"),
     (("--pictures", "no/live"), "live: No such file or directory"),
 )
@@ -402,6 +407,7 @@ def pack(path, members):
 @each_row(
     ("job.json", b"{", "is no progress of a tracker"), ("job.json", None, "no item named 'job.json'"),
     ("state.json", b"{}", "does not describe tensors"), ("state.safetensors", b"", "is damaged"),
+    ("job.json", b"[]", "must hold a TrackResult, a TrackState and what was to be done"),
     ("result.safetensors", None, "no item named 'result.safetensors'"),
 )  # fmt: skip
 def test_damaged_progress_is_refused(run, error_of, command, tmp_path, member, content, message):

@@ -96,15 +96,20 @@ def sized(shape, size):
 
 test_damaged_archives = refusing(lambda folder, content: tr.load_points(put(folder, "a.npz", content)), file="a.npz")(
     (archive(one=POINTS, two=POINTS), r"must hold an array 'points' of shape \(N, 3\), .* got one, two"),
+    (archive(world=POINTS, scan=POINTS, faces=[[0, 1, 2]]), "array of that shape; got faces, scan, world"),
+    (archive(other=POINTS[:, :2]), "must hold an array 'points'"),
     (archive(), "got no arrays"),
     (archive(points=POINTS[:, :2]), r"points must have shape \(N, 3\), got \(4, 2\)"),
+    (archive(points=np.float64(3)), r"points must have shape"),
     (archive(points=POINTS, normals=POINTS[:3]), r"normals must have shape \(4, 3\), got \(3, 3\)"),
     (archive(points=POINTS, faces=[[0, 1, 5]]), "a face names vertex 5, outside 0 to 3"),
+    (archive(points=POINTS, faces=[[0, 1, -1]]), "a face names vertex -1, outside 0 to 3"),
     (archive(points=POINTS, faces=[[0, 1]]), r"faces must have shape \(F, 3\)"),
     *((archive(points=POINTS, faces=[[0, 1, bad]]), "faces must be whole numbers") for bad in (1.5, np.nan, np.inf)),
     *((archive(points=POINTS, faces=np.array([[0, 1, value]], kind)), "faces are out of range") for kind, value in (
         ("f8", 2.0**53), ("i8", -(2**53)), ("u8", 2**64 - 1), ("i8", -(2**63))
     )),
+    (archive(points=POINTS, faces=np.array([[0, 1, 2**53 - 1]])), f"a face names vertex {2**53 - 1}"),
     *((archive(points=np.zeros((2, 3), kind)), r"member 'points\.npy' must hold real numbers") for kind in (
         bool, complex, "U4", "M8[s]", [("x", "f4")]
     )),
@@ -134,7 +139,7 @@ def test_zip_bombs_and_odd_archives_are_refused_before_expanding(tmp_path):
             lambda: read(tmp_path, "a.npz", zipped({"a": b"1"}, zipfile.ZIP_BZIP2)),
             "is packed by method 12; use deflate",
         ),
-        (lambda: read(tmp_path, "a.npz", bytes(encrypted)), "'points.npy' is encrypted"),
+        (lambda: read(tmp_path, "a.npz", bytes(encrypted)), "is encrypted; save the archive without a password"),
     )
 
 

@@ -91,20 +91,28 @@ test_damaged_ply = refusing(
     lambda folder, old, new: read(folder, "a.ply", swap(ply("ascii").decode(), old, new)), file="a.ply"
 )(
     ("ply\n", "plo\n", "must start with 'ply'"),
+    ("end_header", "end_heather", "must start with 'ply' and a header closed"),
     ("format ascii 1.0", "format ascii 2.0", "the header line 'format ascii 2.0' is not understood"),
     ("format ascii 1.0\n", "", "must name one format"),
+    ("element vertex 4", "element vertex -4", "header line 'element vertex -4'"),
     ("element vertex 4", "element vertex 5", "the header says 9 rows, the file holds 8"),
     ("element vertex 4", "element vertex 99999999999999", "claims 99999999999999 points"),
+    ("element face 2", "element face 99999999999999", "claims 99999999999999 faces"),
     ("element edge 1", "element face 1", "two elements of one name"),
     ("element edge 1\nproperty int a\nproperty int b", "element edge 1", "'edge' has no properties"),
     ("property int a", "property int b", "or two of one name"),
     ("property double y", "property double yy", "must have an element 'vertex' with the properties x, y and z"),
+    ("property double y", "property decimal y", "header line 'property decimal y'"),
     ("list uchar int", "list float int", "is counted in float; an integer type is needed"),
     ("\n3 -1", "\n4 -1", "shorter than its list says"),
     ("\n3 -1", "\n2 -1", "longer than its list says"),
+    ("\n3 -1", "\nnan -1", "shorter than its list says"),
+    ("7 3 0", "7 2 0", "longer than its list says"),
     ("7 3 0 1 2", "7 3 0 1 1.5", "vertex indices must be whole numbers"),
+    ("7 3 0 1 2", "7 3 0 x 2", "is not a row of 1 numbers"),
     ("7 3 0 1 2", "7 3 0 1 9", "a face names vertex 9|a face names a vertex"),
     ("150 0.0", "256 0.0", "colors must lie between 0 and 255"),
+    ("150 0.0", "-1 0.0", "colors must lie between 0 and 255"),
     ("150 0.0 0.9", "150 0.0", "is not a row of 7 numbers"),
     ("\n0 1\n", "\n0 1\n1 2 3 4\n", "the header says 8 rows"),
 )
@@ -272,14 +280,19 @@ def test_encodings_of_pcd_agree(tmp_path, data, rgb):
 test_damaged_pcd = refusing(lambda folder, old, new: read(folder, "a.pcd", swap(pcd("ascii", "U").decode(), old, new)))(
     ("DATA ascii", "DATA", "must have a header closed by a line 'DATA ascii'"),
     ("DATA ascii", "DATA zipped", "DATA 'zipped' is unknown"),
+    ("FIELDS x ", "FIELDS y ", "FIELDS are missing or not unique"),
     ("FIELDS x ", "FIELDS w ", "must have the fields x, y and z, got w, normal_x"),
+    ("SIZE 8 4", "SIZE 8", "must be equally long"),
     ("SIZE 8 4", "SIZE 3 4", "'x' has an unknown TYPE 'F' of SIZE '3'"),
     ("COUNT 1", "COUNT 0", "has the COUNT '0'"),
     ("WIDTH 3", "WIDTH 4", "POINTS is not WIDTH x HEIGHT"),
     ("POINTS 6", "POINTS six", "POINTS must be a number, got 'six'"),
+    ("WIDTH 3\nHEIGHT 2\n", "WIDTH 7\nHEIGHT 1\n", "POINTS is not"),
     ("VERSION .7", "VERSION .7\nVERSION .7", "says VERSION twice"),
     ("WIDTH 3\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 6", "WIDTH 0\nHEIGHT 1\nPOINTS 0", "holds no points"),
+    ("\nPOINTS 6", "\nPOINTS 999999999999", "POINTS is not"),
     (" 66051 ", " 4294967296 ", "rgb must lie between 0 and 4294967295"),
+    (" 66051 ", " -1 ", "rgb must lie between 0 and 4294967295"),
 )
 
 
@@ -369,15 +382,24 @@ def test_corners_of_stl_have_the_precision_of_the_file_and_only_equal_ones_are_j
 
 test_damaged_stl = refusing(lambda folder, content: read(folder, "a.stl", content), file="a.stl")(
     (stl()[:-1], r"must hold 84 \+ 50 x 2 bytes .*, got 183: it is cut off, damaged or not STL"),
+    (stl()[:-50], r"84 \+ 50 x 2 bytes .*, got 134"),
     (stl() + b"\0", r"84 \+ 50 x 2 bytes .*, got 185"),
+    (stl(count=1), r"84 \+ 50 x 1 bytes .*, got 184"),
     (stl(count=2**32 - 1), r"84 \+ 50 x 4294967295 bytes .*, got 184"),
+    (stl()[:83], "got 83"),
     (stl([]), "holds no points"),
     ("solid nothing\nendsolid\n", "not STL"),
     *((stl_text().replace(old, new), words) for old, new, words in (
         ("endsolid part\n", "", "holds 2 facets, 2 of them closed, with 6 corners and no 'endsolid' at its end"),
+        ("endfacet\nendsolid part\n", "", "holds 2 facets, 1 of them closed, with 6 corners and no 'endsolid'"),
         ("endfacet\nendsolid", "endsolid", "holds 2 facets, 1 of them closed, with 6 corners and an 'endsolid'"),
         ("    vertex 1.0 1.0 0.0\n", "", "holds 2 facets, 2 of them closed, with 5 corners"),
+        ("    vertex 1.0 1.0 0.0\n", "vertex 1 1 0\n" * 2, "with 7 corners"),
+        ("endsolid part\n", "endsolid part\nfacet", "holds 3 facets, 2 of them closed, with 6 corners and no"),
+        ("1.0 1.0 0.0", "1.0 1.0", "a corner is not a row of 3 numbers"),
+        ("1.0 1.0 0.0", "1.0 1.0 0.0 0.0", "a corner is not a row of 3 numbers"),
         ("1.0 1.0 0.0", "1.0 1.0 O.0", "a corner is not a row of 3 numbers"),
+        (" 1.0 1.0 0.0", "", "corner"),
     )),
     ("solid x\nfacet normal 0 0 1\nouter loop\n" + "vertex 0 0 0\n" * 4 + "endloop\nendfacet\nfacet normal 0 0 1\n"
      "outer loop\n" + "vertex 1 0 0\n" * 2 + "endloop\nendfacet\nendsolid x\n", "cut off or damaged"),

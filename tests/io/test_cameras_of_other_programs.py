@@ -50,8 +50,10 @@ def saved(tmp_path, content, name="camera.json"):
     {"w": 64.0, "h": 48.0, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.5, "cy": 23.5, "camera_angle_x": 0.98},
     {"image_width": 64, "image_height": 48, "K": ROWS, "D": [0.0] * 5, "distortion_model": "plumb_bob",
      "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [*ROWS, 0, 0, 0]},
+     {"image_size": [64, 48], "K": np.array(ROWS).reshape(3, 3).tolist(), "dist": [[0.0] * 5]},
     SIZE | {"camera_matrix": np.array(ROWS).reshape(3, 3).tolist(), "dist_coeffs": []},
     SIZE | {"intrinsics": WANTED},
+    SIZE | {"camera_matrix": {"rows": 3, "cols": 3, "data": ROWS}, "distortion_coefficients": {"data": [0.0] * 5}},
 )  # fmt: skip
 def test_json_of_other_programs(tmp_path, entry):
     path = saved(tmp_path, entry)
@@ -129,9 +131,14 @@ def test_lenses_of_other_kinds_are_refused(tmp_path, model):
 
 @each(
     PLAIN | {"camera_type": "fisheye", "D": FISHEYE},
+    PLAIN | {"lens_model": "Equidistant", "D": FISHEYE},
+    PLAIN | {"projection": "equidistant", "coeffs": FISHEYE},
     PLAIN | {"type": "KannalaBrandt8", "coeffs": FISHEYE},
+    PLAIN | {"fisheye": True, "D": FISHEYE},
+    PLAIN | {"w": 64, "is_fisheye": True} | K4,
     PLAIN | {"camera_model": "OPENCV_FISHEYE"} | K4,
     PLAIN | {"camera_model": "OPENCV_FISHEYE"},  # without numbers it is still no pinhole
+    PLAIN | {"camera_model": "OPENCV"} | K4,  # k4 belongs to a fisheye, or to a longer polynomial
     PLAIN | K4,
     PLAIN | {"xi": 1.2, "D": FISHEYE},
     PLAIN | {"lens": {"model": "fisheye", "k": FISHEYE}},
@@ -235,8 +242,10 @@ def test_settings_of_orb_slam(tmp_path):
 
 test_what_is_no_camera_is_refused = refusing(lambda folder, entry: tr.load_cameras(saved(folder, entry)))(
     (PLAIN | {"distorsion": [0.1, 0, 0, 0]}, "holds distorsion, which no camera has; is it distortion?"),
+    (PLAIN | {"depthscale": 0.001}, "is it depth_scale?"),
     (SIZE | {"K": [1, 2, 3]}, r"K must hold 3 x 3 numbers \(or fx, fy, cx, cy\), got 3"),
     (SIZE | {"K": [60, 5, 31.5, 0, 61, 23.5, 0, 0, 1]}, "K must be fx 0 cx, 0 fy cy, 0 0 1"),
+    (SIZE | {"K": ["a"] * 9}, "K must hold numbers, got"),
     ({"K": ROWS}, "lacks width, height"),
 )
 

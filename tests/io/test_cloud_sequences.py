@@ -108,13 +108,18 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     ["frame_0.5.xyz", "frame_1.0.xyz", "frame_1.25.xyz", "frame_1.5.xyz", "frame_10.0.xyz"],
     ["t=0.05.png", "t=0.1.png", "t=0.25.png", "t=0.3.png"],
     ["t=-2.ply", "t=-0.5.ply", "t=0.ply", "t=1.ply"],
+    ["scan-2.ply", "scan-9.ply", "scan-10.ply"],
     ["2024.01.15.ply", "2024.02.01.ply", "2024.10.01.ply"],
     ["take1.1.ply", "take1.2.ply", "take1.10.ply", "take1.100.ply", "take2.1.ply"],
+    ["walk.1.ply", "walk.2.ply", "walk.10.ply"],
+    ["a1b2.ply", "a1b10.ply", "a2b1.ply"],
     ["9.ply", "10.ply", "10a.ply", "b.ply"],
     ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
     ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
     ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
+    ["3e-9f.ply", "3e-10f.ply"],
     ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
+    ["v1.2.9.ply", "v1.2.10.ply", "v1.10.1.ply"],
 )
 def test_names_sort_as_a_person_would(tmp_path, names):
     pictures = [f"{name.rpartition('.')[0]}.png" for name in names]
@@ -188,9 +193,12 @@ test_damaged_archives = refusing(lambda folder, arrays: tr.load_frames(archived(
     ({"points": STACK[..., :2]}, r"frame 0 must have shape \(M, 3\), got \(4, 2\)"),
     ({"points": STACK[:0]}, "holds no frames"),
     ({"points": STACK, "counts": [1, 5]}, "counts must be 2 numbers from 0 to 4"),
+    ({"points": STACK, "counts": [1]}, "counts must be 2 numbers"),
     ({"points": STACK, "counts": [1.5, 2]}, "counts must be whole numbers"),
     ({"points": STACK, "mask": np.ones((2, 3), bool)}, r"mask must have the shape \(2, 4\)"),
+    ({"points": STACK, "mask": np.ones((2, 4))}, "'mask' must hold truth values"),
     ({"points": STACK, "mask": np.ones((2, 4), bool), "counts": [1, 2]}, "not both"),
+    ({"points": STACK.astype(complex)}, "'points' must hold real numbers"),
     ({"points": np.full((2, 4, 3), None)}, "pickled objects are never loaded"),
     ({"frame_0": STACK[0], "frame_1": STACK[0, :, :2]}, "frame 1 must have shape"),
 )

@@ -102,10 +102,13 @@ test_damaged_sparse_parts = refusing(
     ).accessor(0)
 )(
     ({"count": 0}, "has 0 entries of unusable type or number"),
+    ({"count": 5}, "has 5 entries of unusable type or number"),
     ({"indices": None}, r"accessors\[0\] of 4 elements is sparse, but lacks indices or values"),
+    ({"values": {}}, "lacks indices or values"),
     ({"indices": {"bufferView": 1, "componentType": 5126}}, "unusable type"),
     ({"indices": {"bufferView": 2, "componentType": 5125}}, "points at element 1090519040 of 4"),
     ({"values": {"bufferView": 1}}, "reaches beyond its buffer"),
+    ({"values": {"bufferView": 9}}, "must be an index below 3"),
 )
 
 
@@ -114,13 +117,18 @@ test_damaged_numbers = refusing(
 )(
     ("accessors", {"count": 6}, r"accessors\[0\] of 6 elements reaches beyond its buffer"),
     ("accessors", {"count": -1}, r"accessors\[0\] claims -1 elements"),
+    ("accessors", {"count": True}, "'count' must be of type int, got bool"),
     ("accessors", {"count": 10**30}, "more than the size limit allows"),
     ("accessors", {"byteOffset": -4}, r"byteOffset of accessors\[0\] of 5 elements is -4"),
+    ("accessors", {"byteOffset": 4}, "reaches beyond its buffer"),
     ("accessors", {"componentType": 5124}, "unknown type 5124"),
+    ("accessors", {"componentType": [5126]}, r"unknown type \[5126\]"),
     ("accessors", {"type": "VEC5"}, "must be SCALAR or VEC2 .* got 'VEC5'"),
+    ("accessors", {"type": {}}, "got {}"),
     ("accessors", {"bufferView": None}, "has no data"),
     ("accessors", {"bufferView": True}, r"refers to bufferViews\[True\], but there are 1"),
     ("bufferViews", {"byteLength": 61}, r"bufferViews\[0\] reaches beyond its buffer of 60 bytes"),
+    ("bufferViews", {"byteLength": 59}, "reaches beyond its buffer"),
     ("bufferViews", {"byteOffset": -1}, r"byteOffset of bufferViews\[0\] is -1"),
     ("bufferViews", {"byteStride": 13}, "reaches beyond its buffer"),
     ("bufferViews", {"byteStride": -12}, "byteStride of .* is -12"),
@@ -129,6 +137,7 @@ test_damaged_numbers = refusing(
     ("buffers", {"byteLength": 61}, "buffer 0 should have 61 bytes, got 60"),
     ("buffers", {"byteLength": -1}, "byteLength of buffer 0 is -1"),
     ("buffers", {"uri": None}, "neither an address nor a binary chunk"),
+    ("buffers", {"uri": 5}, "'uri' must be of type str"),
     ("buffers", {"uri": "data:text/plain,abcd"}, "must be base64: 'data:text/plain'"),
     ("buffers", {"uri": "data:a;base64,%%%"}, "not valid base64"),
 )
@@ -202,7 +211,9 @@ def test_containers_hold_json_and_one_binary_chunk():
 
 test_what_is_no_document = refusing(lambda _, content: opened(content))(
     (b"{", "not a readable glTF document"),
+    (b"\xff\xfe", "not a readable glTF document"),
     (b"[" * 100_000, "not a readable glTF document"),
+    (b"1" * 10_000, "not a readable glTF document|must be glTF"),
     (b"[]", "must be glTF of version 2, whose JSON is an object; got list"),
     (b'{"extensionsRequired": 3}', "'extensionsRequired' must be of type list, got int"),
     (b'{"extensionsRequired": ["EXT_meshopt_compression"]}', "needs the extension EXT_meshopt_compression"),
@@ -236,11 +247,15 @@ test_impossible_nodes = refusing(
     lambda _, nodes: (found := opened({"nodes": nodes})).node_globals(found.node_parents())
 )(
     ([{"children": [1]}, {"name": "tip", "children": [0]}], ModelError, "cyclic at 0, 'tip'"),
+    ([{"children": [0]}], ModelError, "cyclic at 0"),
     ([{"children": [2]}, {"children": [2]}, {}], ModelError, "node 2 has two parents"),
     ([{"children": [1]}], FormatError, "a child of node 0 must be an index below 1"),
     ([{"rotation": [0, 0, 0, 0]}], ModelError, "the rotation of node 0 is a zero quaternion"),
     ([{"scale": [1, 2]}], FormatError, r"the scale of node 0 must hold 3 numbers, got \[1, 2\]"),
     ([{"scale": [1, 2, "3"]}], FormatError, "the scale of node 0 must hold 3 numbers"),
+    ([{"scale": [1, 2, True]}], FormatError, "the scale of node 0 must hold 3 numbers"),
+    ([{"matrix": [1]}], FormatError, "the matrix of node 0 must hold 16 numbers"),
     ([{"name": "a", "translation": [0, 1e301, 0]}], ModelError, "the translation of node 'a' is not finite"),
+    ([{"translation": [0, float("nan"), 0]}], ModelError, "the translation of node 0 is not finite"),
     ([{"translation": [0, 10**400, 0]}], ModelError, "the translation of node 0 is not finite"),
 )

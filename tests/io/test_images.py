@@ -242,14 +242,19 @@ OPEN3D = {"intrinsic_matrix": [60.0, 0, 0, 0, 61.0, 0, 31.5, 23.5, 1], "depth_sc
 UNITS = [
     ({"depth_scale": 0.001}, 0.001),
     ({"depth_units": 0.0001}, 0.0001),
+    ({"depth_unit": 0.00025}, 0.00025),
+    ({"depthScale": 0.001}, 0.001),
     ({"depth_unit": "mm"}, 0.001),
     ({"depth_units": "Millimeters"}, 0.001),
     ({"depth_factor": 5000.0}, 0.0002),
+    ({"depth_factor": 1000}, 0.001),
+    ({"DepthMapFactor": 5000}, 0.0002),
     ({"RGBD.DepthMapFactor": 5000}, 0.0002),
     ({"png_depth_scale": 6553.5}, 1 / 6553.5),
     ({"scale": 6553.5}, 1 / 6553.5),
     ({"depth_scale": 0.001, "depth_factor": 1000}, 0.001),
     ({"scale": 0.5}, None),  # of the picture
+    ({"scale": 2.0}, None),
     ({}, None),
 ]
 

@@ -19,10 +19,13 @@ def test_one_frame_and_several_with_unseen_keypoints(tmp_path):
 
 test_other_lists = refusing(lambda folder, content: load_keypoints(put(folder, "k.json", content)), file="k.json: ")(
     ("{", "cannot be read as JSON"),
+    ([], "must hold a list of keypoints"),
     ({"keypoints": []}, "must hold a list of keypoints .* an object with keypoints"),
+    ([None, None], "must hold a list of keypoints"),
     ([[1, 2], [1, 2, 3]], r"of \[2, 3\] numbers"),
     ([[[1, 2]], [[1, 2], [3, 4]]], r"lists of \[1, 2\] keypoints"),
     ([["a", 2]], "must hold numbers, got 'a'"),
+    ([[True, 2]], "must hold numbers, got True"),
     ("[[1e999, 2]]", "must hold numbers, got inf"),
 )
 

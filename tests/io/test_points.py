@@ -133,8 +133,10 @@ def test_omit_drops_faces_and_renumbers(tmp_path):
 
 
 @each_row(
+    ("a.ply", PLY.format("binary_little_endian", 10**12, "float", "")),
     ("a.ply", PLY.format("ascii", 10**12, "float", "1 2 3\n")),
     ("a.ply", PLY.format("binary_little_endian", 10**7, "float", "1 2 3\n")),
+    ("a.pcd", PCD.format(10**12, "binary")),
     ("a.pcd", PCD.format(10**7, "binary")),
     ("a.pcd", PCD.format(10**7, "binary_compressed") + "\0" * 50),
     ("a.stl", b"\0" * 80 + b"\xff\xff\xff\xff" + b"\0" * 100),

@@ -109,9 +109,11 @@ def test_an_armature_that_turns_its_rig_stands_it_up(tmp_path, tip, joint):
 
 @each_row(
     ([1, 1, 1.3], "0.3 of it unlike others: 'tip'; this is baked"),
+    ([2, 2, 2], "1 of it unlike others: 'tip'; this is baked"),
     ([1, 1, -1], "2 of it unlike others: 'tip'; this is baked"),
     ([1.5, 0.8, 1], "0.5 of it unlike others: 'tip'; this is baked"),
     ([1.02, 1.02, 1.02], "0.02 of it unlike others: 'tip'; this is left out"),
+    ([1, 0.99, 1], "0.01 of it unlike others: 'tip'; this is left out"),
 )
 def test_scales_of_bones_are_baked_unless_they_are_small(tmp_path, scene, scale, told):
     scene.rig(tip={"scale": scale, "rotation": TURN} if max(scale) > 1.1 else {"scale": scale})

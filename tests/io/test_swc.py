@@ -50,5 +50,6 @@ def test_files_of_others_are_read(tmp_path):
 test_damaged_swc = refusing(lambda folder, content: load_swc(put(folder, "bad.swc", content)), file="bad.swc: ")(
     ("1 1 0 0 x 1 -1\n", "line 1 is no node"), ("1 1 0 0 0 1 -1\n2 1 0 0 0 1 7\n", "make no tree"),
     ("1 1 0 0 0 1 -1\n2 1 0 0 0 1 -1\n", "make no tree"), ("1 1 0 0 nan 1 -1\n", "make no tree"),
+    ("1 1 0 0 0 1\n", "line 1 is no node .6 columns"),
     ("", "make no tree"),
 )  # fmt: skip

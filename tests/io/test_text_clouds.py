@@ -84,14 +84,22 @@ def test_columns_of_colors_and_normals_are_recognized(tmp_path, name, content, k
 
 test_damaged_tables = refusing(lambda folder, text: read(folder, "a.xyz", text), file="a.xyz: ")(
     ("", "holds no points"),
+    ("0\n", "holds no points"),
     ("# nothing\n", "holds no points"),
     ("x y z\n", "holds no points"),
     ("0.5\n", r"a row of 3 numbers or more \(x y z first\), got 1"),
+    ("1 2\n3 4\n", r"a point must be a row of 3 numbers or more \(x y z first\), got 2"),
     ("0 0 0\n0 0 0 0 0 1\n", "a point is not a row of equally many numbers"),
+    ("0 0 0\n0 0 # 0\n", "a point is not a row of equally many numbers"),
     ("0 0 0\n1 0 0\n0 1\n0 0 1\n", r"line 3 holds 2 \('0 1'\), the first row 3"),
     ("# c\n0 0 0\n1 zero 0\n", "line 3 holds 'zero'"),
+    ("0 0 0\n0 0 0x10\n", "line 2 holds '0x10'"),
     ("1 2 3\n1 2 \u0663\n", "a point is not a row"),
+    ("1 2 3\n\xff", "not a row"),
+    ("7\n", "the first line says 7 points, the file holds 0: it is cut off"),
     ("3\n1 2 3\n4 5 6\n", "the first line says 3 points, the file holds 2"),
+    ("1\nx y z\n0 0 0\n1 1 1\n", "the first line says 1 points, the file holds 2"),
+    ("y x\n0 0\n", "the columns must name x, y and z, got y x"),
     ("x,y,q\n1,2,3\n", "the columns must name x, y and z, got x y q"),
     ("ply\nformat ascii 1.0\n", "must start with 'ply'|the columns must name x, y and z, got ply"),
     ("1.234,5;2;3\n4;5;6\n", "numbers with commas stand between semicolons or tabs"),
@@ -169,6 +177,7 @@ def test_vertices_and_faces_of_obj(tmp_path, text, faces):
 @each_row(
     ("f 1//1 2//2 3//3\n", True), ("f -3//-3 -2//2 3//-1\n", True), ("f 1/9/1 2/9/2 3/9/3\n", True), ("", True),
     ("f 1//1 2//2 3//1\n", False), ("f 1//3 2//2 3//1\n", False),
+    ("f 1//1 2//2 3\n", False), ("f 1/1 2/2 3/3\n", False),
 )  # fmt: skip
 def test_normals_of_obj_are_read_where_each_vertex_has_its_own(tmp_path, faces, kept):
     normals = read(tmp_path, "a.obj", "v 0 0 0\nvn 1 0 0\nv 1 0 0\nvn 0 1 0 # up\nv 0 1 0\nvn 0 0 1\n" + faces).normals
@@ -181,14 +190,20 @@ test_damaged_obj = refusing(lambda folder, text: read(folder, "a.obj", text), fi
     ("# nothing\n", "holds no points"),
     ("f 1 2 3\n", "outside 1 to 0"),
     (SQUARE + "f 1 2 5\n", "a face names a vertex outside 1 to 4: the file is cut off or damaged"),
+    (SQUARE + "f 1 0 1\n", "a face names a vertex outside 1 to 4"),
+    ("v 0 0 0\nf -2 -1 -1\nv 1 0 0\n", "a face names a vertex outside 1 to 2"),
     (SQUARE + "f 1/1 /2 3/3\n", "each vertex index must hold 1 numbers|a vertex index is not a row"),
     (SQUARE + "f a b c\n", "a vertex index is not a row"),
     (SQUARE + "f 1 2 1e300\n", "vertex indices are out of range"),
+    (SQUARE + "f 1 2 nan\n", "vertex indices must be whole numbers"),
     (SQUARE + "f 1 1.5 1\n", "vertex indices must be whole numbers"),
     ("v 0 0 0\nvn 0 0 1\nf 1//2 1//1 1//1\n", "a face names a normal outside 1 to 1"),
+    ("v 0 0 0\nvn 0 0 1\nf 1//0 1//1 1//1\n", "a face names a normal outside 1 to 1"),
     ("v 0 0 0\nvn 0 1\nf 1//1 1//1 1//1\n", "each normal must hold 3 numbers, got 2"),
+    ("v 1 2\n", "a vertex must be 3 numbers"),
     ("v 0 0 0 0 0\n", r"a vertex must be 3 numbers \(with w 4, with a color 6 or 7\), got 5"),
     ("v 0 0 0\nv 0 0 0 1 1\n", "a vertex is not a row of equally many numbers: row 2 holds 5"),
+    ("v 0 0 0\nv\n", "each vertex must hold"),
 )
 
 

@@ -190,9 +190,12 @@ test_impossible_robots = refusing(load, ModelError, file="robot.urdf")(
     (robot(), "1 to 2000 links, got 0"),
     (robot(*(links(f"l{i}") for i in range(2001))), "1 to 2000 links, got 2001"),
     (robot(links("a", "a")), "two links are called 'a'"),
+    (robot("<link/>"), "link number 0 has no name"),
     (robot(links("a", "b", "c"), joint("j", "a", "b"), joint("j", "a", "c")), "two joints are called 'j'"),
     (robot(PAIR), "disconnected, 2 links have no parent: a, b"),
     (robot(PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
+    (robot(links("r"), PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
+    (robot(PAIR, joint("j", "a", "a")), "disconnected|cycle"),
     (robot(PAIR, joint("j", "a", "b"), joint("k", "a", "b")),
      "'b' has two parents, joints 'j' and 'k': a closed loop is no tree; leave one"),
     (robot(PAIR, joint("j", "a", "z")), "joint 'j' has child link 'z'"),
@@ -200,12 +203,14 @@ test_impossible_robots = refusing(load, ModelError, file="robot.urdf")(
     (pair(kind="helical"), "joint 'j' is of type 'helical'; supported: revolute"),
     (pair("<axis xyz='0 0 0'/>"), "joint 'j' has a zero axis"),
     (pair("<origin xyz='0 nan 0'/>"), "joint 'j': xyz='0 nan 0'.*not finite"),
+    (pair("<origin rpy='inf 0 0'/>"), "not finite"),
     (pair("<limit lower='2' upper='1'/>"), "joint 'j' has limits 2.0 to 1.0"),
     (pair("<mimic joint='z'/>"), "mimics joint 'z', which the file does not"),
     (pair("<mimic joint='j'/>"), "mimics joint 'j' in a cycle"),
     (robot(links("a", "b", "c"), FIXED), "mimics joint 'f', which is fixed"),
 )  # fmt: skip
 test_damaged_files = refusing(load, file="robot.urdf")(
+    ("", "not well-formed XML"),
     ("<robot>", "not well-formed XML"),
     *(
         (b"<?xml version='1.0' encoding='klingon'?><robot/>", "not well-formed XML"),
@@ -215,6 +220,7 @@ test_damaged_files = refusing(load, file="robot.urdf")(
     ("<robot>" + "<a>" * 64 + "</a>" * 64 + "</robot>", "nests elements more than 64 deep"),
     ("<robot>" + "<a>" * 63 + "</a>" * 63 + "</robot>", ModelError, "1 to 2000 links, got 0"),
     ("<sdf/>", "must be <robot>, got <sdf>"),
+    ("<robot><xacro:macro/></robot>", "expand them first"),
     ("<robot xmlns:xacro='http://www.ros.org/wiki/xacro'><xacro:macro name='m'/></robot>", "expand them first"),
     ("<robot><link name='${prefix}a'/></robot>", "expand them first"),
     (robot("<xacro:macro name='m'/>"), "holds xacro macros"),
@@ -357,9 +363,13 @@ def reading(folder, name, content):
 
 test_damaged_meshes = refusing(reading)(
     ("bad.stl", b"solid nothing", r"bad\.stl: must hold 84 \+ 50 x 0 bytes"),
+    ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: .*it is cut off, damaged or not STL"),
+    ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: 1 of 3 points are not finite"),
     ("far.obj", b"v 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n", r"far\.obj: a face names a vertex outside 1 to 3"),
     ("empty.obj", b"v 0 0 0\n", r"empty\.obj: holds 1 points but no faces"),
+    ("bad.ply", b"ply\nformat ascii 1.0\n", r"bad\.ply: "),
     ("bad.off", b"OFF\n8 6 0\n", r"bad\.off: the header says 8 vertices and 6 faces"),
     ("bad.glb", b"glTF", r"bad\.glb: is cut off in its header"),
     ("mesh.fbx", b"x", r"mesh\.fbx: is of a format that is not read .*export it as glTF"),
+    ("mesh.what", b"x", r"mesh\.what: has the unknown ending"),
 )

@@ -30,12 +30,15 @@ def saved(folder, content):
 
 @each(
     ARM.replace("<robot name", "<robot xmlns='http://www.ros.org' name"),
+    ARM.replace("<robot name", "<robot xmlns:xi='http://www.w3.org/2001/XInclude' name"),
     ARM.replace("</robot>", "<sensor:camera name='eye'><rate>30</rate></sensor:camera></robot>"),
     ARM.replace("<", "<u:").replace("<u:/", "</u:").replace("<u:robot", "<u:robot xmlns:u='http://ros.org'"),
     "<!-- generated -->\n<?xml version='1.0'?>\n" + ARM,
+    "<!-- a -->\n<!-- b -->\n\n<?xml version='1.0' encoding='UTF-8'?>\n" + ARM,
     ARM.replace("</robot>", "<!-- <link name='old'/> -- kept for later --></robot>"),
     ARM.replace("</robot>", "<!-- <link name='old'><!-- inner --></link> --></robot>"),
     ARM + "\0\0\n",
+    b"\xef\xbb\xbf" + ARM.encode(),
     ("<?xml version='1.0' encoding='utf-16'?>" + ARM).encode("utf-16"),
     b"\r\n \n<?xml version='1.0'?>" + ARM.replace("\n", "\r\n").encode(),
 )

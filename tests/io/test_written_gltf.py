@@ -164,22 +164,31 @@ def test_parts_move_with_their_parents(tmp_path):
     assert player.attribute("NORMAL", 1) is None
 
 
+MIRROR = np.tile(np.diag([1.0, 1.0, -1.0, 1.0]), (4, 1, 1))
 NONRIGID = np.tile(np.diag([1.0, 1.0, 1.1, 1.0]), (4, 1, 1))
 
 
 test_bad_skins = refusing(lambda folder, change: save(folder / "a.glb", scene() | change), InputError, leaves=0)(
     ({"vertices": np.zeros((30, 2))}, r"vertices must have shape \(V, 3\)"),
+    ({"vertices": np.full((30, 3), np.nan)}, "vertices must be finite"),
     ({"faces": np.full((1, 3), 30)}, "faces must hold indices from 0 to 29, got 30 to 30"),
+    ({"faces": np.zeros((0, 3), int)}, "at least one triangle"),
     ({"weights": np.zeros((30, 4))}, "30 zero row"),
     ({"weights": -np.ones((30, 4))}, "not be negative"),
+    ({"weights": np.ones((30, 3))}, r"weights must have shape \(30, 4\)"),
     ({"joint_names": ["a", "b", "a", "c"]}, "occur more than once: a"),
+    ({"joint_names": []}, "at least one name"),
+    ({"parents": [-1, 0, 1]}, r"one index per joint \(4\), got 3"),
     ({"parents": [-1, 0, 1, 4]}, "parents of joint 'other' must be -1 to 3, got 4"),
     ({"parents": [-1, 2, 1, 0]}, "cycle: root, middle"),
     ({"rest_transforms": NONRIGID}, "rest_transforms must hold rigid motions"),
+    ({"rest_transforms": MIRROR}, "rest_transforms must hold rigid motions"),
     ({"joint_transforms": np.zeros((5, 4, 4, 4))}, r"joint_transforms must have shape \(6, 4, 4, 4\)"),
     ({"times": np.zeros(6)}, "strictly increasing"),
     ({"times": np.arange(6) - 1.0}, "not negative"),
+    ({"times": np.zeros(0)}, "must not be empty"),
     ({"colors": np.full((30, 3), 255.0)}, r"colors must lie in \[0, 1\]"),
+    ({"colors": np.zeros((29, 3))}, r"colors must have shape \(30, 3\)"),
     ({"normals": np.zeros((29, 3))}, r"normals must have shape \(30, 3\)"),
 )
 
