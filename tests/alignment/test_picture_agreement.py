@@ -7,6 +7,7 @@ import torch
 
 import torchreg as tr
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureAgreement
+from torchreg.alignment.search.in_picture import judged
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import rasterize
 
@@ -58,14 +59,30 @@ def test_what_hides_a_hand_is_no_hole_in_it(skin, pose, depth):
     assert min(float(before.uncovered), float(beyond.uncovered)) > 0.3
 
 
-def test_a_ball_has_no_relief_of_a_hand(skin, pose, depth):
+def ball():
+    """The picture (H, W) of a ball half a metre away, before a wall."""
     column, row = torch.meshgrid(torch.arange(160) - 79.5, torch.arange(120) - 59.5, indexing="xy")
     height = (0.05**2 - (0.5 / 190) ** 2 * (column.square() + row.square())).clamp_min(0).sqrt()
-    ball = torch.where(height > 0, 0.53 - height, 1.0).float()
-    found = agreement(skin, pose, ball)
+    return torch.where(height > 0, 0.53 - height, 1.0).float()
+
+
+def test_a_ball_has_no_relief_of_a_hand(skin, pose):
+    found = agreement(skin, pose, ball())
     assert float(found.relief) > 0.7
     assert float(found.smooth) > 0.5
     assert float(PICTURE_MODEL.probability(found.table())) < PICTURE_MODEL.against
+
+
+def test_a_result_is_in_doubt_where_the_picture_shows_something_else(plain_hand, skin, pose, depth):
+    crop = tr.DepthFrame(depth, CAMERA, depth < 0.8)
+    found = tr.align(plain_hand, crop, pose, model_points=skin, config=tr.AlignConfig(search="never"))
+    assert found.status.usable
+    assert judged(found, crop, skin) is found
+    round_thing = tr.DepthFrame(ball(), CAMERA, ball() < 0.8)
+    other = judged(found, round_thing, skin)
+    assert other.status is tr.Status.DOUBTFUL
+    assert float(other.confidence) < PICTURE_MODEL.against
+    assert "looks like the shape with a probability of" in other.doubt
 
 
 def test_the_agreement_does_not_depend_on_where_the_world_begins(skin, pose, depth):

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
+import torch
+
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureAgreement
 from torchreg.alignment.evidence.reliability import CALIBRATION
@@ -94,7 +96,8 @@ def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin) -> Align
     reason = f"what the picture shows there looks like the shape with a probability of {there:.1%}"
     status = Status.DOUBTFUL if found.statuses[0].usable else found.status
     doubt = "; ".join(filter(None, (reason, str(found.doubt))))
-    return replace(found, confidence=found.pose.new_tensor(min(_confidence(found), there)), status=status, doubt=doubt)
+    confidence = torch.as_tensor(found.confidence).clamp_max(there)
+    return replace(found, confidence=confidence, status=status, doubt=doubt)
 
 
 def _not_found_if_improbable(found: AlignResult) -> AlignResult:
