@@ -151,11 +151,7 @@ def fit_coefficients(
     space = shape.coefficient_space()
     if isinstance(space, ClothedSpace) and not space.surely:
         count = len(space) - len(space.body)
-        judged, state = bare_where_likelier(fine, state, count, _fit_again, noise_covariance)
-        if judged is not fine:
-            # Where clothes had drawn limbs, a bare body is annealed once more.
-            state = _placed_again(judged, state, descend)
-        fine = judged
+        fine, state = bare_where_likelier(fine, state, count, _fit_closely, noise_covariance)
         problem = replace(problem, prior=fine.prior)
     finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
     before = finish(state, steps=SHAPE_FIT.fine_steps).pose
@@ -163,9 +159,9 @@ def fit_coefficients(
     return replace(_fitted(problem, before, last, shape), lead=lead)
 
 
-def _fit_again(problem: ShapeProblem, state: Tensor) -> Tensor:
-    """Return states (T, D + K) fitted from those of a problem that is a little different."""
-    return fit_surface(problem, state, steps=SHAPE_FIT.fine_steps).pose
+def _fit_closely(problem: ShapeProblem, state: Tensor) -> Tensor:
+    """Return states (T, D + K) fitted from nearly right ones."""
+    return fit_surface(problem, state, steps=SHAPE_FIT.fine_steps, widths=SURFACE_FIT.widths[-1:]).pose
 
 
 def _placed_again(problem: ShapeProblem, state: Tensor, descend: _Descent) -> Tensor:
