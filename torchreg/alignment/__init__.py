@@ -9,8 +9,8 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
   measured keypoints: `MeasuredKeypoints`, `keypoint_skin`; recursive shape coefficients: `PersonFilter`, `KnownPerson`;
 - what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `near_outlier_share`, `limb_ends`,
-  `end_motions`, `end_variances`, `dof_confidence`; in words `spread_of`;
+  `end_motions`, `end_variances`, `dof_confidence`, `SurfaceError`; in words `spread_of`;
 - checks of input: `check_skin`, `floating_origin`, `warn_about_units`, `warn_about_degenerate`;
 - numbers: `ANNEALING`, `CALIBRATION`, `CLUSTERS`, `INLIER_SHARE`, `INTRUSION`, `OFF_SURFACE`, `PRIOR_SHARE`,
-  `SEARCH_BUDGET`, `SURFACE_FIT`, `UNITS`.
+  `SEARCH_BUDGET`, `SHAPE_CALIBRATION`, `SURFACE_FIT`, `UNITS`.
 """
