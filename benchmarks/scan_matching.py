@@ -53,8 +53,8 @@ SURE = 30.0
 
 # Mean motions of the points of rigs, in diagonals.
 MOTION = (0.03, 0.15)
-# Pairs of a rig that are drawn until one moves as far as is wanted.
-TRIES = 60
+# Pairs of a rig of which the one counts that moves most nearly as far as is wanted.
+TRIES = 12
 
 
 @dataclass(frozen=True)
@@ -149,19 +149,19 @@ def rigs(folder: Path, count: int) -> Iterator[Pair]:
     """Yield so many pairs of the rigs of kinds that are never trained on, their mean motions spread evenly."""
     with (folder / "index.csv").open(encoding="utf-8", newline="") as index:
         rows = [row for row in csv.DictReader(index) if row["kind"] in HELD_OUT_RIGS and row["torchreg"] == "ok"]
-    for number, row in enumerate(rows * -(-count // len(rows))):
-        if number == count:
-            return
-        low, high = (MOTION[0] + (MOTION[1] - MOTION[0]) * (number + end) / count for end in (0, 1))
+    for number, row in enumerate(itertools.islice(itertools.cycle(rows), count)):
+        wanted = MOTION[0] + (MOTION[1] - MOTION[0]) * (number + 0.5) / count
         drawn = (row["kind"], body_of_rig(folder / row["file"]))
         stream = matching_pairs(2000 + number, bodies=lambda _, drawn=drawn: drawn, body_share=1.0)
-        for found in itertools.islice(stream, TRIES):
-            moved = float((found.source_truth - found.source.points).norm(dim=1).mean()) / found.target.diagonal
-            if low <= moved <= high:
-                yield Pair(row["kind"], found.source, found.target, found.source_truth)
-                break
-        else:
-            print(f"{row['file']}: left out, as no pair of {TRIES} moves by {low:.1%} to {high:.1%}", flush=True)
+        pairs = [
+            Pair(row["kind"], each.source, each.target, each.source_truth) for each in itertools.islice(stream, TRIES)
+        ]
+        yield min(pairs, key=lambda pair, wanted=wanted: abs(mean_motion(pair) - wanted))
+
+
+def mean_motion(pair: Pair) -> float:
+    """Return how far the points of a pair move in the mean, in diagonals of the target."""
+    return float((pair.truth - pair.source.points).norm(dim=1).mean()) / pair.target.diagonal
 
 
 def known(folder: Path) -> Iterator[Pair]:
