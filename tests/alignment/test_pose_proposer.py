@@ -118,7 +118,9 @@ def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_han
         trained = tr.train_initializer(hand, path, config, size=TINY, progress=rows.append)
     assert [row.step for row in rows] == [2, 4]
     assert all(parameter.requires_grad for parameter in hand.parameters())
+    state = torch.get_rng_state()
     again = tr.PoseProposer.load(path, plain_hand)
+    assert torch.equal(torch.get_rng_state(), state)
     points, mask = torch.randn(2, 30, 3) / 20, torch.ones(2, 30, dtype=torch.bool)
     torch.testing.assert_close(again.propose(points, mask).poses, trained.propose(points, mask).poses)
     points = points.to(plain_hand.rest)

@@ -246,7 +246,9 @@ class PoseProposer(nn.Module):
         if record.get("kind") != _KIND:
             raise FormatError(f"{path}: holds no {_KIND}, got {record.get('kind')!r}")
         try:
-            found = _restored(tensors, record, shape)
+            # Layers draw weights before those of the file replace them: the caller's random state stays.
+            with torch.random.fork_rng(devices=[]):
+                found = _restored(tensors, record, shape)
         except (KeyError, TypeError, ValueError, RuntimeError, InputError) as error:
             raise FormatError(f"{path}: holds no {_KIND} of this version ({error})") from error
         if found is None:

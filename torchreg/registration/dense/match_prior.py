@@ -92,7 +92,9 @@ class MatchPrior:
 
 @cache
 def _matcher() -> ScanMatcher:
-    return ScanMatcher().requires_grad_(False)
+    # Layers draw weights before those of the file replace them: the caller's random state stays.
+    with torch.random.fork_rng(devices=[]):
+        return ScanMatcher().requires_grad_(False)
 
 
 def _folded(table: Tensor, count: int) -> Tensor:
