@@ -5,7 +5,7 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 - the problem: `AlignProblem`, `centered_problem`, `alignment_cost`, `GaussianPosePrior`;
 - the annealed EM: `anneal`, `outlier_level`;
 - the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
-- the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `Candidates`, `Plan`, `score_candidates`;
+- the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `Candidates`, `Plan`;
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
   measured keypoints: `MeasuredKeypoints`, `keypoint_skin`; recursive shape coefficients: `PersonFilter`, `KnownPerson`;
 - what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `near_outlier_share`, `limb_ends`,
