@@ -57,8 +57,7 @@ def align_in_picture(
     quick = replace(config, search="never")
     found, crop = surest_crop(frame, model_size(skin), lambda crop: answer(quick, crop), crop_score)
     if _confidence(found) < CHOICE.sure and config.search != "never" and found.coefficients is None:
-        searched = answer(config, crop)
-        found = searched if _confidence(searched) > _confidence(found) else found
+        found = answer(config, crop)
     return replace(_not_found_if_improbable(found), crop=crop.mask)
 
 
