@@ -26,7 +26,7 @@ class Cover:
     parts: tuple[str, ...]  # what the names of the region's parts begin with
 
 
-# From nine dressed men of one set of rigs and the skin of a tenth, in trunks; loose clothes are wider than theirs.
+# From nine dressed men of one set of rigs and the skin of a tenth, in trunks; widened by hand for looser clothes.
 COVERS = (
     Cover(0.015, 0.015, 0.010, ("pelvis", "spine", "clavicle", "shoulder", "breast")),
     Cover(0.010, 0.012, 0.007, ("upperarm",)),
@@ -60,13 +60,12 @@ class ClothedSpace(ShapeSpace):
         normals: (V, 3) of the skin at rest.
         modes: (V, M) by which the offset varies along them, metres, of a standard deviation of one.
         worn: (M,) coefficients of the mean clothes.
-        surely: whether there are any.
     """
 
     normals: Tensor
     modes: Tensor
 
-    def __init__(self, body: ShapeSpace, normals: Tensor, modes: Tensor, worn: Tensor, *, surely: bool = True) -> None:
+    def __init__(self, body: ShapeSpace, normals: Tensor, modes: Tensor, worn: Tensor) -> None:
         prior, one = body.prior, torch.ones_like(worn)
         reach = CLOTH.reach * one + worn.abs()
         super().__init__(CoefficientPrior(
@@ -74,7 +73,7 @@ class ClothedSpace(ShapeSpace):
             mean=torch.cat([prior.mean, worn]), std=torch.cat([prior.std, one]),
             lower=torch.cat([prior.lower, -reach]), upper=torch.cat([prior.upper, reach]),
         ))  # fmt: skip
-        self.body, self.surely = body, surely
+        self.body = body
         self.register_buffer("normals", normals, persistent=False)
         self.register_buffer("modes", modes, persistent=False)
 
@@ -97,9 +96,7 @@ class ClothedSpace(ShapeSpace):
 
     def restricted(self, index: Tensor) -> ClothedSpace:
         """Return the space with some of the vertices only, by index (U,)."""
-        return ClothedSpace(
-            self.body.restricted(index), self.normals[index], self.modes[index], self.worn, surely=self.surely
-        )
+        return ClothedSpace(self.body.restricted(index), self.normals[index], self.modes[index], self.worn)
 
     def clothing_offset(self, coefficients: Tensor) -> Tensor:
         """Return how far clothes lie off the skin (..., V), metres; they are nowhere inside it."""
@@ -120,7 +117,7 @@ def may_be_clothed(shape: ArticulatedShape, clothed: bool | str, fit_shape: bool
     return clothed if is_body else False
 
 
-def clothed_rig(shape: ArticulatedShape, *, surely: bool = True) -> ArticulatedShape:
+def clothed_rig(shape: ArticulatedShape) -> ArticulatedShape:
     """Return a body with clothes: the leading modes of a Gaussian process on its skin as further coefficients."""
     surface, space = shape.file_surface(), shape.coefficient_space()
     region = torch.tensor([
@@ -146,5 +143,5 @@ def clothed_rig(shape: ArticulatedShape, *, surely: bool = True) -> ArticulatedS
     normals = TriangleMesh(points, surface.faces.cpu()).vertex_normals()
     other = copy.deepcopy(shape)
     cloth = (value.to(space.mean) for value in (normals, modes, worn))
-    other.space = ClothedSpace(space, *cloth, surely=surely)
+    other.space = ClothedSpace(space, *cloth)
     return other

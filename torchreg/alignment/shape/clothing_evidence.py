@@ -12,6 +12,8 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.fit.surface_fit import surface_noise
+from torchreg.alignment.shape.clothing import CLOTH
+from torchreg.alignment.shape.person_covariance import noise_covariance
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 
 Fit = Callable[[ShapeProblem, Tensor], Tensor]
@@ -29,24 +31,22 @@ class _Mixture:
 _MIXTURE = _Mixture()
 
 
-def bare_where_likelier(
-    problem: ShapeProblem, state: Tensor, count: int, fit: Fit, covariance: Callable[[ShapeProblem, Tensor], Tensor]
-) -> tuple[ShapeProblem, Tensor]:
-    """Return the problem and states (T, D + K) with the last ``count`` coefficients, of clothes, held at zero.
+def are_clothes_likelier(problem: ShapeProblem, state: Tensor, fit: Fit) -> bool:
+    """Return whether the data are likelier with clothes, whose coefficients are the last of states (T, D + K).
 
-    Where the data are likelier with clothes, those given are returned. Evidence by Laplace's approximation (MacKay
-    1992): data that err together count once, and clothes pay for the volume of their prior that the data exclude.
+    Both hypotheses are fitted from the states, those of a bare person in mean clothes. Evidence by Laplace's
+    approximation (MacKay 1992): data that err together count once, and clothes pay for the volume of their prior that
+    the data exclude.
     """
-    bare = _bare(problem, count)
+    count = CLOTH.num_modes
     naked = state.clone()
     naked[:, -count:] = 0
-    naked = fit(bare, naked)
+    naked, state = fit(_bare(problem, count), naked), fit(problem, state)
     likelihoods, shared = zip(*(_likelihood(problem, each) for each in (naked, state)), strict=True)
-    posterior = covariance(problem, state)[0, -count:, -count:].double()
+    posterior = noise_covariance(problem, state)[0, -count:, -count:].double()
     priors = [_prior_cost(problem, state), _prior_cost(problem, naked, count)]
     gained = float((likelihoods[1] - likelihoods[0]) / min(shared)) - priors[0] + priors[1]
-    gained += 0.5 * float(torch.linalg.slogdet(posterior).logabsdet)
-    return (problem, state) if gained > 0 else (bare, naked)
+    return gained + 0.5 * float(torch.linalg.slogdet(posterior).logabsdet) > 0
 
 
 def _bare(problem: ShapeProblem, count: int) -> ShapeProblem:

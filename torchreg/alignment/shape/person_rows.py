@@ -18,8 +18,8 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.pose_rows import PoseRows
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.shape.clothing import ClothedSpace, clothed_rig
-from torchreg.alignment.shape.clothing_evidence import bare_where_likelier
+from torchreg.alignment.shape.clothing import CLOTH, clothed_rig
+from torchreg.alignment.shape.clothing_evidence import are_clothes_likelier
 from torchreg.alignment.shape.person_covariance import noise_covariance, shared_covariance
 from torchreg.alignment.shape.person_gradient import person_with_gradients
 from torchreg.alignment.shape.person_search import lead_over_rivals, limb_restarts, rotation_restarts
@@ -64,9 +64,9 @@ class PersonRows:
             if clouds.ndim != 2:
                 raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
         poses = None if task.start is None else task.starts(clouds[None], task.start)
-        if task.clothed:
+        if task.clothed is True:
             with torch.no_grad():
-                task = replace(task, shape=clothed_rig(shape, surely=task.clothed is True))
+                task = replace(task, shape=clothed_rig(shape))
         return cls.of_scans(replace(task, seen=seen), clouds[None], valid[None], poses)
 
     @classmethod
@@ -121,15 +121,11 @@ class PersonRows:
         if alike is not None:
             fine, state = self._learned_spread(fine, state, alike)
             problem = replace(problem, prior=replace(problem.prior, precision=fine.prior.precision))
-        space = self.task.shape.coefficient_space()
-        if isinstance(space, ClothedSpace) and not space.surely:
-            count = len(space) - len(space.body)
-            fine, state = bare_where_likelier(fine, state, count, self._fitted_closely, noise_covariance)
-            problem = replace(problem, prior=fine.prior)
         before = self._fitted_closely(problem, state)
         last = replace(self._fit(problem, before, 1, SURFACE_FIT.widths[-1:]), sigma=self.sigma)
         fitted = fitted_shape(problem, before, last, self.task.shape)
-        return FoundPerson(self.task, replace(fitted, lead=self.lead), self.history)
+        found = FoundPerson(self.task, replace(fitted, lead=self.lead), self.history)
+        return self._clothed_where_likelier(found) if self.task.clothed == "auto" else found
 
     @property
     def _searched(self) -> bool:
@@ -178,6 +174,20 @@ class PersonRows:
         # A smaller lead is no evidence.
         better = float(again) < float(costs[best]) - EVIDENCE.lead
         return state.index_copy(0, best, found[choice].unsqueeze(0)) if better else state
+
+    def _clothed_where_likelier(self, bare: FoundPerson) -> FoundPerson:
+        """Return a person in clothes where the data of the scan are likelier with them, else the bare one."""
+        with torch.inference_mode(False), torch.no_grad():
+            task = replace(self.task, shape=clothed_rig(self.task.shape), clothed=True)
+        data, valid = self.problem.data + self.problem.origin.unsqueeze(1), self.problem.valid
+        poses = bare.fitted.poses if task.start is None else task.starts(data, task.start)
+        rows = replace(PersonRows.of_scans(task, data, valid, poses), history=self.history)
+        one = rows.problem.rows(self.problem.people(torch.zeros(1, dtype=torch.int64)))
+        worn = rows.state[:1, -CLOTH.num_modes :]
+        state = torch.cat([bare.fitted.state, worn], dim=-1)
+        if not are_clothes_likelier(one.sample(SHAPE_FIT.fine_data, self.generator), state, self._fitted_closely):
+            return bare
+        return rows.annealed().fitted().restarted().finished()
 
     def _learned_spread(self, problem: ShapeProblem, state: Tensor, alike: Tensor) -> tuple[ShapeProblem, Tensor]:
         """Return the problem with the deviations of alike coefficients learned, and states (T, D + K) fitted.

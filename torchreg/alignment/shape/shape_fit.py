@@ -104,7 +104,7 @@ def fitted_shape(problem: ShapeProblem, before: Tensor, found: StageResult, shap
     poses, coefficients = found.pose.tensor_split([shape.num_dofs], dim=-1)
     space, clothing = shape.coefficient_space(), None
     body = space.body if isinstance(space, ClothedSpace) else space
-    if isinstance(space, ClothedSpace) and bool((problem.prior.mean[0, shape.num_dofs + len(body) :] != 0).any()):
+    if isinstance(space, ClothedSpace):
         clothing = space.clothing_offset(coefficients[0])
     known = shape.num_dofs + len(body)
     covariance = noise_covariance(problem, found.pose)
