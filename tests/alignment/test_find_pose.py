@@ -9,6 +9,7 @@ import torch
 import torchreg as tr
 from tests.alignment.made import TIPS, D, cloud, generator, joint, machine, off, problem_of, shape_of, solid
 from torchreg.alignment.fit.problem import alignment_cost
+from torchreg.alignment.search.multi_start import Candidates
 from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations, typical_poses
 from torchreg.geometry.rotation import so3_exp, so3_log
 
@@ -254,7 +255,8 @@ def test_misfits_are_searched_for_again(find, two_clouds, two_hands, monkeypatch
         poses[:, 1, 2] += 0.01
         if len(searched) < 3:
             poses[-1, :, 2] += 0.02
-        return poses, torch.stack([alignment_cost(problem, poses[:, number]) for number in range(2)], dim=1)
+        costs = torch.stack([alignment_cost(problem, poses[:, number]) for number in range(2)], dim=1)
+        return Candidates(problem, poses, costs)
 
     monkeypatch.setattr("torchreg.alignment.find_pose._search", fail_twice)
     found = find(two_clouds, config=replace(QUICK, num_retries=5, seed=7))
