@@ -9,6 +9,7 @@ import torch
 import torchreg as tr
 from tests.alignment.made import TIPS, D, cloud, generator, joint, machine, off, shape_of, solid
 from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations
+from torchreg.alignment.search.multi_start import Candidates
 from torchreg.geometry.rotation import so3_exp, so3_log
 
 QUICK = tr.FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1, num_model_points=200)
@@ -241,7 +242,7 @@ def test_misfits_are_searched_for_again(find, two_clouds, two_hands, monkeypatch
         if len(searched) < 3:
             poses[-1, :, 2] += 0.02
         away = (problem.surface.distance(problem.data.unsqueeze(1), poses).abs() > 0.004).sum(-1)
-        return poses, away.to(poses)
+        return Candidates(problem, poses, away.to(poses))
 
     monkeypatch.setattr("torchreg.alignment.find_pose._search", fail_twice)
     found = find(two_clouds, config=replace(QUICK, num_retries=5, seed=7))

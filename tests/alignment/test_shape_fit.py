@@ -9,7 +9,7 @@ import torch
 import torchreg as tr
 from tests.alignment.made import person_cloud, person_pose
 from torchreg.alignment.shape.person_search import limb_restarts
-from torchreg.alignment.shape.shape_fit import _problem
+from torchreg.alignment.shape.shape_fit import shape_problem
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import sample_surface
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp, so3_log
@@ -196,7 +196,7 @@ def test_a_limb_on_the_data_of_another_is_swung_onto_its_own(person):
     pose, data = scan(person, coefficients, seed=3, one_sided=False, count=800)
     names = list(person.dof_names)
     arm = [names.index(f"{person.part_names[2]}_{axis}") for axis in "xyz"]
-    problem, state = _problem(
+    problem, state = shape_problem(
         person, data[None], torch.ones(1, len(data), dtype=torch.bool), pose[None], None, config=QUICK,
         generator=torch.Generator().manual_seed(0),
     )  # fmt: skip

@@ -129,13 +129,13 @@ def test_scans_of_a_robot_become_its_description(done, error_of, registered, tmp
         def save(self, path):
             asked.append(path)
 
-    def known(given, bones, grid, on_step):
-        asked.append((len(given), bones, grid))
+    def known(given, bones, grid, on_step, reference):
+        asked.append((len(given), bones, grid, reference))
         return Found()
 
     monkeypatch.setattr("torchreg.registration.register_sequence.register_sequence", known)
     output = done(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
-    assert asked == [(3, 8, 25), tmp_path / "robot.safetensors", tmp_path / "robot.urdf"]
+    assert asked == [(3, 8, 25, "auto"), tmp_path / "robot.safetensors", tmp_path / "robot.urdf"]
     assert "converged, confidence 70% in the worst scan: 2 links, 1 hinges and 0 sliders" in output
     assert "joint_1 does not explain how its two links move" in output
     lines = (tmp_path / "robot_joints.csv").read_text().splitlines()

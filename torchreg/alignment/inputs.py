@@ -100,12 +100,13 @@ class Observation:
         check_choice(support, "support", SUPPORTS)
         left = support == "keep" or self.frames or self.points is None
         points = None if left else as_float_tensor(self.points, "data")
-        if points is None or points.ndim not in (2, 3) or points.shape[-1] != 3:
+        if points is None or points.ndim not in (2, 3) or points.shape[-1] != 3 or points.numel() == 0:
             return self
-        valid = points.isfinite().all(-1)
-        if self.mask is not None and self.mask.shape != valid.shape:
-            return self
-        valid = valid if self.mask is None else valid & self.mask.to(valid.device)
+        mask, valid = self.mask, points.isfinite().all(-1)
+        if mask is not None:
+            if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != valid.shape:
+                return self
+            valid = valid & mask.to(valid.device)
         kept = valid.clone()
         clouds = points.detach().reshape(-1, *points.shape[-2:])
         for cloud, rest in zip(clouds, kept.view(-1, kept.shape[-1]), strict=True):

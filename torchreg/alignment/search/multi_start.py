@@ -23,7 +23,7 @@ class SearchBudget:
     num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
     num_model_points: int = 120  # that cover the shape
     num_compared: int = 60  # model points by which candidates are compared
-    max_ranked: int = 300  # best candidates, of which different ones are taken
+    max_ranked: int = 400  # best candidates, of which different ones are taken
     noise: float = 0.01  # standard deviation of the data for the weight of the prior
     cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
     device_entries: int = 150_000_000  # of a table in memory on other devices: enough to keep them busy

@@ -93,14 +93,16 @@ def find_robot(
     part: Tensor,
     scans: Sequence[Target] | None = None,
     reference: int = 0,
+    *,
+    sparse: bool = False,
 ) -> RobotModel:
     """Return the robot of a reference scan that was registered to T scans.
 
     Parts, and pieces of them, propose motions; samples take those of least description length. Two links that touch
     hold together, turn, slide or move freely, by the criterion of Schwarz on what the data hold of their relative
     motions; those that hold together are one. The joints of most evidence make a tree, whose axes and values are fitted
-    to all scans together; links and joints are then looked for once more from there. Last, the surface that all scans
-    show of the links takes the place of the reference's own samples.
+    to all scans together; links and joints are then looked for once more from there. Last, ``sparse`` scans, points
+    whose normals are estimates, are compared with each other on each link.
 
     ``part``: (N,) labels of bones, at least as many as links that registration tells apart (Isack and Boykov 2012 for
     the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most evidence).
