@@ -62,8 +62,7 @@ class AlignResult(Result):
             from the left), from the curvature of the last fit's objective, with data that err together counted once.
         confidence: probability, from 0 to 1, that the ends of the limbs are right to a twentieth of the shape's size on
             average; calibrated on made-up data, see `alignment.evidence.reliability`.
-        evidence: (E,) what the confidence rests on, see `alignment.evidence.reliability.Evidence`; of a whole picture
-            also how it agrees with the pose, see `alignment.evidence.picture_agreement.PictureAgreement`.
+        evidence: (E,) what the confidence rests on, see `alignment.evidence.reliability.Evidence`.
         doubt: what is doubtful, in a sentence, and what the data do not determine, whatever the status; empty where
             nothing is. A tuple for a batch.
         crop: (H, W) bool, the pixels of a whole depth picture in which the shape was found; distances, inliers and
