@@ -8,8 +8,8 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import TIPS, D, cloud, generator, joint, machine, off, shape_of, solid
-from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations
 from torchreg.alignment.search.multi_start import Candidates
+from torchreg.alignment.search.rough_poses import PrincipalAxes, UniformRotations, UprightRotations
 from torchreg.geometry.rotation import so3_exp, so3_log
 
 QUICK = tr.FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1, num_model_points=200)

@@ -41,7 +41,8 @@ def test_a_hinge_is_found_to_a_degree_in_points_a_tenth_of_the_thing_apart(scans
     rough = moved.clone()
     rough[1:, 700:] += torch.tensor([0.004, -0.004, 0.002])
     part = torch.arange(2).repeat_interleave(700)
-    found = find_robot(ranged[0].points, ranged[0].normals, rough, part, [Target(s.points, s.normals) for s in ranged])
+    targets = [Target(scan.points, scan.normals) for scan in ranged]
+    found = find_robot(ranged[0].points, ranged[0].normals, rough, part, targets, sparse=True)
     (joint,) = found.tree.joints[1:]
     axis, origin = torch.tensor(joint.axis, dtype=torch.float64), found.origins()[1]
     assert math.degrees(math.acos(min(1.0, abs(float(axis @ AXIS))))) < 1

@@ -263,7 +263,9 @@ class SequenceRegistration(Result):
             seen, facing = self.observed.cpu().double(), self.observed_normals.cpu().double()
             scans = [Target(seen[frame], facing[frame]) for frame in chosen]
             normals = facing[chosen[self.reference]]
-        found = find_robot(self.points, normals, self.deformed, self.labels, scans, self.reference)
+        found = find_robot(
+            self.points, normals, self.deformed, self.labels, scans, self.reference, sparse=self.faces is None
+        )
         write_robot(path, found, self.points, self.faces, scans)
         return found
 

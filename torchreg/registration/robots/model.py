@@ -20,7 +20,7 @@ from torchreg.geometry.poisson_disk import poisson_disk
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
-from torchreg.registration.robots.fit import Mechanism, axis_stds, fitted, settled
+from torchreg.registration.robots.fit import HasBlocks, Mechanism, axis_stds, fitted, settled
 from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.joints import Candidate, best_joint, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
@@ -126,14 +126,17 @@ def find_robot(
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
-    fused, mechanism = compared_with_each_other(scans, surfaces, mechanism, label, frames)
-    motions = mechanism.motions()
+    fit: tuple[HasBlocks, Noise] = surfaces, noise
+    if sparse:
+        fused, mechanism = compared_with_each_other(scans, surfaces, mechanism, label, frames)
+        motions = mechanism.motions()
+        fit = fused, fused.noise(motions)
     loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
     found = _described(mechanism, points, link, frames, residuals, loose)
-    axis, origin = axis_stds(fused, mechanism, label, fused.noise(motions), found.origins())
+    axis, origin = axis_stds(fit[0], mechanism, label, fit[1], found.origins())
     return replace(found, axis_std=axis[1:], origin_std=origin[1:])
 
 
