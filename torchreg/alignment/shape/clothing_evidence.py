@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.fit.surface_fit import surface_noise
@@ -25,7 +24,7 @@ class _Mixture:
 
     reach: float = 0.1  # of the others, to both sides, as a share of the size
     steps: int = 20  # of EM, which hardly changes the likelihood further
-    bare_precision: float = 1e6  # of the coefficients of clothes that there are none of
+    bare_std: float = 0.2  # of the modes of clothes on bare skin: errors of a body's model, 2 to 3 mm
 
 
 _MIXTURE = _Mixture()
@@ -34,37 +33,35 @@ _MIXTURE = _Mixture()
 def are_clothes_likelier(problem: ShapeProblem, state: Tensor, fit: Fit) -> bool:
     """Return whether the data are likelier with clothes, whose coefficients are the last of states (T, D + K).
 
-    Both hypotheses are fitted from the states, those of a bare person in mean clothes. Evidence by Laplace's
-    approximation (MacKay 1992): data that err together count once, and clothes pay for the volume of their prior that
-    the data exclude.
+    Both hypotheses are fitted from the states, those of a bare person in mean clothes: the skin of a bare person is off
+    the model by as much as bodies are. Evidence by Laplace's approximation (MacKay 1992): data that err together count
+    once, and a hypothesis pays for the volume of its prior that the data exclude.
     """
-    count = CLOTH.num_modes
-    naked = state.clone()
-    naked[:, -count:] = 0
-    naked, state = fit(_bare(problem, count), naked), fit(problem, state)
+    bare, naked = _bare(problem), state.clone()
+    naked[:, -CLOTH.num_modes :] = 0
+    naked, state = fit(bare, naked), fit(problem, state)
     likelihoods, shared = zip(*(_likelihood(problem, each) for each in (naked, state)), strict=True)
-    posterior = noise_covariance(problem, state)[0, -count:, -count:].double()
-    priors = [_prior_cost(problem, state), _prior_cost(problem, naked, count)]
-    gained = float((likelihoods[1] - likelihoods[0]) / min(shared)) - priors[0] + priors[1]
-    return gained + 0.5 * float(torch.linalg.slogdet(posterior).logabsdet) > 0
+    gained = float(likelihoods[1] - likelihoods[0]) / min(shared)
+    return gained + _prior_evidence(problem, state) - _prior_evidence(bare, naked) > 0
 
 
-def _bare(problem: ShapeProblem, count: int) -> ShapeProblem:
-    """Return the problem whose last coefficients are zero."""
+def _bare(problem: ShapeProblem) -> ShapeProblem:
+    """Return the problem of a bare person."""
     prior = problem.prior
-    worn = torch.arange(prior.precision.shape[-1]) >= prior.precision.shape[-1] - count
-    held = replace(
+    worn = torch.arange(prior.precision.shape[-1]) >= prior.precision.shape[-1] - CLOTH.num_modes
+    skin = replace(
         prior, mean=torch.where(worn, 0.0, prior.mean),
-        precision=torch.where(worn, _MIXTURE.bare_precision, prior.precision),
+        precision=torch.where(worn, _MIXTURE.bare_std**-2, prior.precision),
     )  # fmt: skip
-    return replace(problem, prior=held)
+    return replace(problem, prior=skin)
 
 
-def _prior_cost(problem: ShapeProblem, state: Tensor, count: int = 0) -> float:
-    """Return the prior's cost of states (T, D + K) without that of their last coefficients."""
-    kept = state.shape[-1] - count
-    prior = replace(problem.prior, precision=pad(problem.prior.precision[..., :kept], (0, count)))
-    return float(prior.cost(state).sum())
+def _prior_evidence(problem: ShapeProblem, state: Tensor) -> float:
+    """Return the prior's density at states (T, D + K) times the posterior's volume of clothes, as a logarithm."""
+    posterior = noise_covariance(problem, state)[0, -CLOTH.num_modes :, -CLOTH.num_modes :].double()
+    precision = problem.prior.precision[..., -CLOTH.num_modes :].double()
+    volume = torch.linalg.slogdet(posterior).logabsdet + precision.log().sum()
+    return 0.5 * float(volume) - float(problem.prior.cost(state).sum())
 
 
 def _likelihood(problem: ShapeProblem, state: Tensor) -> tuple[Tensor, float]:
