@@ -34,14 +34,14 @@ def are_clothes_likelier(problem: ShapeProblem, state: Tensor, fit: Fit) -> bool
     """Return whether the data are likelier with clothes, whose coefficients are the last of states (T, D + K).
 
     Both hypotheses are fitted from the states, those of a bare person in mean clothes: the skin of a bare person is off
-    the model by as much as bodies are. Evidence by Laplace's approximation (MacKay 1992): data that err together count
-    once, and a hypothesis pays for the volume of its prior that the data exclude.
+    the model by as much as bodies are. Evidence by Laplace's approximation (MacKay 1992): data that err together under
+    either count once, and a hypothesis pays for the volume of its prior that the data exclude.
     """
     bare, naked = _bare(problem), state.clone()
     naked[:, -CLOTH.num_modes :] = 0
     naked, state = fit(bare, naked), fit(problem, state)
     likelihoods, shared = zip(*(_likelihood(problem, each) for each in (naked, state)), strict=True)
-    gained = float(likelihoods[1] - likelihoods[0]) / min(shared)
+    gained = float(likelihoods[1] - likelihoods[0]) / max(shared)
     return gained + _prior_evidence(problem, state) - _prior_evidence(bare, naked) > 0
 
 
