@@ -38,8 +38,9 @@ class PictureModel:
     """The logistic model of whether a picture shows a shape about where a pose is: ``bias - sum_k weight_k e_k``.
 
     That is the logarithm of the Bayes factor, the odds in favor where as many poses are as are not. ``e`` is the table
-    of `PictureAgreement`. Fitted by ``benchmarks/scenes.py --calibrate`` to 213 alignments in crops of made-up rooms,
-    of which 75 lie on a hand, also of other proportions and with things in it, or an arm.
+    of `PictureAgreement`. Fitted to 213 alignments in crops of made-up rooms, of which 75 lie on a hand, also of other
+    proportions and with things in it, or an arm: answers of the search, and fits from the truth and from poses off it.
+    ``benchmarks/scenes.py --calibrate`` draws such a mixture anew, not these very ones.
     """
 
     bias: float = 5.16
