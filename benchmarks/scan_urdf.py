@@ -21,7 +21,6 @@ import math
 import sys
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,6 +34,7 @@ import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import invert_rigid
+from torchreg.io.urdf import load_urdf
 from torchreg.io.urdf_file.record import UrdfPrimitive
 from torchreg.registration.robots.model import RobotModel
 from torchreg.shapes.posed_tree import PosedTree
@@ -174,8 +174,8 @@ def show_hexapod(folder: Path, generator: torch.Generator | None) -> None:
     angles, across = official_errors(folder / "robot_clouds/hexapod_official.urdf", directions, points)
     right = (angles < DEGREES) & (across < METERS)
     print(
-        f"hexapod, clouds {order.tolist()}: {int(right.sum())} of {len(right)} joints right, {len(axes)} found; "
-        f"those off {angles[right].median():.1f} degrees, {1000 * across[right].median():.1f} mm in the median; "
+        f"hexapod, clouds {order.tolist()}: {int(right.sum())} of {len(right)} joints right, {len(axes)} found; the "
+        f"right ones are off by {angles[right].median():.1f} degrees, {1000 * across[right].median():.1f} mm in the median; "
         f"{found.status}, {spent:.0f} CPU s",
         flush=True,
     )
@@ -187,10 +187,9 @@ def official_errors(path: Path, directions: Tensor, points: Tensor) -> tuple[Ten
     The robot's base and joint values are those for which its axes lie best on the found ones, by robust least squares
     with assignments in turn.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        shape = tr.ArticulatedShape.from_urdf(path, dtype=torch.float64, with_surface=False)
-    arm = Arm(shape, torch.empty(0, 3), torch.empty(0, 3), torch.empty(0), shape.rest.unsqueeze(0))
+    record = load_urdf(path, meshes="skip")
+    tree = PosedTree(record.tree, [joint.name for joint in record.tree.joints], None, free_base=True).double()
+    arm = Arm(tree, torch.empty(0, 3), torch.empty(0, 3), torch.empty(0), tree.rest.unsqueeze(0))
 
     def errors(pose: np.ndarray) -> tuple[Tensor, Tensor]:
         axes, origins = replace(arm, poses=torch.from_numpy(pose).unsqueeze(0)).axes()
@@ -198,7 +197,7 @@ def official_errors(path: Path, directions: Tensor, points: Tensor) -> tuple[Ten
         across = (off - (off * axes.unsqueeze(1)).sum(-1, keepdim=True) * axes.unsqueeze(1)).norm(dim=-1)
         return torch.linalg.cross(axes.unsqueeze(1), directions.expand_as(off)).norm(dim=-1).arcsin(), across
 
-    pose = shape.rest.numpy().copy()
+    pose = tree.rest.numpy().copy()
     for width in (0.04, 0.02, 0.01, 0.01, 0.01):
         angle, across = errors(pose)
         own = linear_sum_assignment((0.1 * angle + across).clamp_max(5 * width))
