@@ -175,8 +175,8 @@ def show_hexapod(folder: Path, generator: torch.Generator | None) -> None:
     right = (angles < DEGREES) & (across < METERS)
     print(
         f"hexapod, clouds {order.tolist()}: {int(right.sum())} of {len(right)} joints right, {len(axes)} found; the "
-        f"right ones are off by {angles[right].median():.1f} degrees, {1000 * across[right].median():.1f} mm in the median; "
-        f"{found.status}, {spent:.0f} CPU s",
+        f"right ones are off by {angles[right].median():.1f} degrees, {1000 * across[right].median():.1f} mm in the "
+        f"median; {found.status}, {spent:.0f} CPU s",
         flush=True,
     )
 

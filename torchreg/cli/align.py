@@ -114,12 +114,7 @@ def align(
     """
     views.check()
     check_used(fit_shape, "--fit-shape", {"--rig": rig})
-    if rig is not None and Path(shape).suffix.lower() not in (".glb", ".gltf"):
-        raise InputError(f"--rig has no meaning for {shape}, which is no rigged character; leave it out")
-    if upright and start is not None:
-        raise InputError("--upright is of a search, which --start leaves out; give one of them")
-    if views.depth and support != "auto":
-        raise InputError("--support is of clouds, and has no meaning with --depth; leave it out")
+    _check_together(shape, rig, searched_upright=upright and start is not None, in_picture=views.depth, support=support)
     pictures = views.source(clouds) if views.depth else None
     direction = known_up(up, clouds, camera=views.depth)
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
@@ -153,6 +148,16 @@ def align(
         raise interruption(f"{len(run.results)} of {len(clouds)} clouds are done")
     if not all(result.statuses[0].usable for result in run.results):
         raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _check_together(shape: str, rig: Path | None, *, searched_upright: bool, in_picture: bool, support: str) -> None:
+    """Raise InputError where options contradict each other."""
+    if rig is not None and Path(shape).suffix.lower() not in (".glb", ".gltf"):
+        raise InputError(f"--rig has no meaning for {shape}, which is no rigged character; leave it out")
+    if searched_upright:
+        raise InputError("--upright is of a search, which --start leaves out; give one of them")
+    if in_picture and support != "auto":
+        raise InputError("--support is of clouds, and has no meaning with --depth; leave it out")
 
 
 @dataclass(frozen=True)

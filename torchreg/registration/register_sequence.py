@@ -174,10 +174,7 @@ def register_sequence(
     for scan in scans:
         check_inputs((scan, scan), num_bones, grid_resolution)
     warn_about_rounding(scans[0].points, "points of scans", scans[0].diagonal, stacklevel=4)
-    if reference != "auto":
-        check_count(reference, "reference", 0)
-        if reference >= len(scans):
-            raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
+    _check_reference(reference, len(scans))
     origin = far_origin([scan.points for scan in scans])
     scans = tuple(to_local(scan, origin) for scan in scans)
     degenerate = warn_about_flat_scans(scans, stacklevel=4)
@@ -205,6 +202,14 @@ def register_sequence(
     found = _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
     doubtful = bool((sure < SCAN_CALIBRATION.doubtful).any()) and found.status.usable
     return to_world(replace(found, confidence=sure, status=Status.DOUBTFUL if doubtful else found.status), origin)
+
+
+def _check_reference(reference: int | Literal["auto"], count: int) -> None:
+    """Raise InputError unless a reference is "auto" or the number of one of so many scans."""
+    if reference != "auto":
+        check_count(reference, "reference", 0)
+        if reference >= count:
+            raise InputError(f"reference must be below the number of scans {count}, got {reference}")
 
 
 def _aligned_frames(
