@@ -15,7 +15,7 @@ from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.fit.annealed_em import OnStep
 from torchreg.alignment.inputs import Task
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.pose_rows import PoseRows
+from torchreg.alignment.pose_rows import ROWS, PoseRows
 from torchreg.alignment.results import AlignResult
 from torchreg.alignment.search.in_picture import align_in_picture
 from torchreg.alignment.search.landmark_fit import KeypointRows
@@ -30,9 +30,6 @@ from torchreg.geometry.camera import Camera
 from torchreg.geometry.far_origin import to_world
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
-
-# Data in a batch, from which all threads of torch are of use.
-_MANY_DATA = 10_000
 
 
 def align(
@@ -144,7 +141,7 @@ def _aligned(task: Task, data: Any, mask: Tensor | None = None, **keypoints: Any
     """Return the alignment to one observation, in seven steps."""
     task = task.observed(data, mask, **keypoints)
     rows = _starts(task)
-    is_small = rows.problem.valid.numel() < _MANY_DATA
+    is_small = rows.problem.valid.numel() < ROWS.many_data
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode(), one_thread(is_small):
         rows = rows.annealed()  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3

@@ -30,16 +30,16 @@ from torchreg.solvers.e_step import expectation
 
 
 @dataclass(frozen=True)
-class _Limits:
-    """When a pose means nothing."""
+class RowNumbers:
+    """Numbers of a batch of alignments."""
 
-    min_inliers: int = 10  # with fewer
+    min_inliers: int = 10  # with fewer a pose means nothing
     min_share: float = 0.02  # the same, as a share of the data
+    num_starts: int = 4  # poses of a search, of which rivals are reported: a box looks alike from as many sides
+    many_data: int = 10_000  # in a batch, from which all threads of torch are of use
 
 
-_LIMITS = _Limits()
-# Poses of a search, of which rivals are told: a box looks alike from as many sides.
-_NUM_STARTS = 4
+ROWS = RowNumbers()
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +235,7 @@ def _search(task: Task) -> FoundStarts:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
         config = FindPoseConfig(num_model_points=points, nan_policy=policy, seed=seed)
-        return search_everywhere(task, _NUM_STARTS, config)
+        return search_everywhere(task, ROWS.num_starts, config)
 
 
 def _different(rows: PoseRows, rivals: Tensor) -> Tensor:
@@ -250,7 +250,7 @@ def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, 
         return Status.NO_DATA
     if degenerate:
         return Status.DEGENERATE
-    if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
+    if num_inliers < max(ROWS.min_inliers, ROWS.min_share * num_data):
         return Status.FEW_INLIERS
     if confidence < CALIBRATION.doubtful:
         return Status.DOUBTFUL

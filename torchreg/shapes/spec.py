@@ -22,7 +22,7 @@ SOLID_CHOICES = ("auto", *PRIMITIVE_KINDS)
 class RigSurface:
     """The surface mesh of a file, in the pose of all zeros, with weights (V, P) and colors (P, 3) from 0 to 1.
 
-    Vertices of rigid links are few or many wherever their makers liked.
+    The density of the vertices of rigid links is arbitrary.
     """
 
     vertices: Tensor

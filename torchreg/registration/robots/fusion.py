@@ -57,13 +57,13 @@ class FusedScans:
         """Return the scans of all frames but the reference, whose pose stays, to compare with all.
 
         A point belongs to the link of the nearest of the moved samples (F, n, 3), which are those of the links (n,);
-        the motions (F, K, 4, 4) of links pull it back.
+        it moves into the reference by the inverse of its motion (F, K, 4, 4).
         """
         links = [label[NeighborTree(own).nearest(scan.points)[0]] for scan, own in zip(scans, moved, strict=True)]
-        pulled = [_pulled_back(*row) for row in zip(scans, links, motions, strict=True)]
+        placed = [_in_reference(*row) for row in zip(scans, links, motions, strict=True)]
         points, normals, link = (
-            torch.cat([row[0] for row in pulled]),
-            torch.cat([row[1] for row in pulled]),
+            torch.cat([row[0] for row in placed]),
+            torch.cat([row[1] for row in placed]),
             torch.cat(links),
         )
         frame = torch.arange(len(scans)).repeat_interleave(torch.tensor([len(own) for own in links]))
@@ -108,7 +108,7 @@ class FusedScans:
         As of `Target.residuals`: across the plane, and squared with what is along it beyond the spacing.
         """
         scan, link = self.scans[frame], self.links[frame]
-        points, normals = _pulled_back(scan, link, motions)
+        points, normals = _in_reference(scan, link, motions)
         nearest = self.trees[frame].nearest(_place(points, normals, link, scan.spacing, self.size))[0]
         turn = motions[link]
         moved = (turn[:, :3, :3] @ self.points[frame][nearest].unsqueeze(-1)).squeeze(-1) + turn[:, :3, 3]
@@ -119,7 +119,7 @@ class FusedScans:
         return moved, facing, across, across.square() + (along - scan.spacing).clamp_min(0).square()
 
 
-def _pulled_back(scan: Target, link: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
+def _in_reference(scan: Target, link: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
     """Return the points and normals (M, 3) of a scan in the reference, by the motions (K, 4, 4) of their links (M,)."""
     back = invert_rigid(motions)[link]
     turned = (back[:, :3, :3] @ scan.normals.unsqueeze(-1)).squeeze(-1)
