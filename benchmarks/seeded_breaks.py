@@ -1,6 +1,6 @@
 """How much of what could break the tests notice: seeded breaks of the code, one at a time.
 
-    python benchmarks/seeded_breaks.py --count 200            # two hours of one core; --jobs 2 for two
+    python benchmarks/seeded_breaks.py --count 200 --covered breaks.db     # an hour of one core; --jobs 2 for two
     python benchmarks/seeded_breaks.py --count 40 --limit 60 --room spines
     python benchmarks/seeded_breaks.py --root ../before --like .    # another checkout, at the places that both have
     python benchmarks/seeded_breaks.py --smoke                # one break, to see that it runs
@@ -8,10 +8,11 @@
 A break swaps a comparison, a sum and a difference, a product and a quotient, "and" and "or", or doubles a number, in
 a function of torchreg, in a copy of the checkout. Places are drawn evenly over the lines of all rooms, by a hash of
 the function's name and of what stands there: a function that only moves to another file keeps its breaks.
-The tests of a break are those that import its module, then those of its room and of all public names, up to the first
-that fails. A break that the suite has not noticed within the limit of processor time is counted by itself: it tells
-of the limit, not of the suite. Breaks that change nothing (a bound that no input reaches) stay unnoticed in any suite:
-compare shares of two suites.
+The tests of a break are those that run its line, where ``--covered`` says which they are (the whole suite is run once
+for that, a quarter of an hour, if there is no such file), else those that import its module, then those of its room and
+of all public names; nearest first, up to the first that fails. A break that the suite has not noticed within the limit
+of processor time is counted by itself: the limit is the reason, not the suite. Breaks that change nothing (a bound that
+no input reaches) stay unnoticed in any suite: compare shares of two suites.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parents[1]
 COMPARISONS = {ast.Lt: ">", ast.Gt: "<", ast.LtE: ">=", ast.GtE: "<=", ast.Eq: "!=", ast.NotEq: "=="}
@@ -145,6 +150,29 @@ def tests_of(found: Break, root: Path) -> list[str]:
     return list(dict.fromkeys(str(path.relative_to(root)) for paths in nearest for path in paths))
 
 
+def covering(found: Break, root: Path, covered: CoverageData) -> list[str]:
+    """Return the tests that run the line of a break, nearest files first, not more than a command can name."""
+    file = next((name for name in covered.measured_files() if name.endswith(str(found.file))), "")
+    tests_by_line = covered.contexts_by_lineno(file)
+    line = max((line for line in tests_by_line if line <= found.start[0]), default=0)
+    tests = {context.partition("|")[0] for context in tests_by_line.get(line, []) if context}
+    nearest = {name: place for place, name in enumerate(tests_of(found, root))}
+    return sorted(tests, key=lambda test: (nearest.get(test.partition("::")[0], len(nearest)), test))[:2000]
+
+
+def coverage_of(root: Path, file: Path) -> CoverageData:
+    """Return which tests run which line of a checkout; its whole suite makes the file if there is none."""
+    from coverage import CoverageData
+
+    if not file.exists():
+        options = ["-q", "--cov=torchreg", "--cov-context=test", "--cov-report=", "--cov-fail-under=0"]
+        environment = {**os.environ, "COVERAGE_FILE": str(file.resolve()), "PYTHONPATH": str(root)}
+        subprocess.run([sys.executable, "-m", "pytest", *options], cwd=root, env=environment, check=False)
+    data = CoverageData(str(file))
+    data.read()
+    return data
+
+
 def copied(root: Path, folder: Path) -> Path:
     """Copy what tests need of a checkout, and return the folder."""
     for name in (*FOLDERS, "pyproject.toml", "README.md"):
@@ -155,22 +183,24 @@ def copied(root: Path, folder: Path) -> Path:
     return folder
 
 
-def outcome(found: Break, copy: Path, limit: float) -> str:
+def outcome(found: Break, copy: Path, tests: Sequence[str], limit: float) -> str:
     """Return "noticed" where a test of a copy with the break fails, else "MISSED", or "no time" beyond the limit."""
+    if not tests:
+        return "MISSED"
     broken = copy / found.file
     whole = broken.read_text()
     options = ["-x", "-q", "-p", "no:cacheprovider", "--no-header"]
-    command = [sys.executable, "-m", "pytest", *options, *tests_of(found, copy)]
+    command = [sys.executable, "-m", "pytest", *options, *tests]
     environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     try:
         broken.write_text(found.applied(whole))
-        with subprocess.Popen(command, cwd=copy, env=environment, start_new_session=True, **quiet) as tests:
-            resource.prlimit(tests.pid, resource.RLIMIT_CPU, (round(limit), round(limit) + 1))
+        with subprocess.Popen(command, cwd=copy, env=environment, start_new_session=True, **quiet) as run:
+            resource.prlimit(run.pid, resource.RLIMIT_CPU, (round(limit), round(limit) + 1))
             try:
-                code = tests.wait(20 * limit)  # something may wait for ever
+                code = run.wait(20 * limit)  # something may wait for ever
             except subprocess.TimeoutExpired:
-                os.killpg(tests.pid, signal.SIGKILL)
+                os.killpg(run.pid, signal.SIGKILL)
                 code = -1
     finally:
         broken.write_text(whole)
@@ -186,26 +216,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--room", action="append", default=[], help="break this room only; may be given several times")
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout")
     parser.add_argument("--like", type=Path, help="another checkout: only places that it has as well")
+    parser.add_argument("--covered", type=Path, help="file of which tests run which line; made if there is none")
     parser.add_argument("--smoke", action="store_true", help="one break of a small module")
     given = parser.parse_args(arguments)
     if given.smoke:
         given.count, given.room = 1, ["metrics.py"]
     root = given.root.resolve()
     chosen = drawn(given.count, given.seed, root, given.room, given.like)
+    covered = None if given.covered is None else coverage_of(root, given.covered)
+    suites = [tests_of(found, root) if covered is None else covering(found, root, covered) for found in chosen]
     counts, copies = Counter[tuple[str, str]](), SimpleQueue[Path]()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(given.jobs) as pool:
         for number in range(given.jobs):
             (Path(folder) / str(number)).mkdir()
             copies.put(copied(root, Path(folder) / str(number)))
 
-        def tried(found: Break) -> str:
+        def tried(found: Break, tests: list[str]) -> str:
             copy = copies.get()
             try:
-                return outcome(found, copy, given.limit)
+                return outcome(found, copy, tests, given.limit)
             finally:
                 copies.put(copy)
 
-        for found, result in zip(chosen, pool.map(tried, chosen), strict=True):
+        for found, result in zip(chosen, pool.map(tried, chosen, suites), strict=True):
             counts[found.room, result] += 1
             place = f"{found.file}:{found.start[0]} {found.function}"
             print(f"{result} {place}: {found.text.strip()}", flush=True)

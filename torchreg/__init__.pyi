@@ -27,6 +27,8 @@ from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
 from torchreg.capture.depth import load_depth_scan as load_depth_scan
 from torchreg.capture.depth_frame import DepthFrame as DepthFrame
+from torchreg.capture.moved import MovedMasks as MovedMasks
+from torchreg.capture.moved import moved_masks as moved_masks
 from torchreg.capture.silhouette_frames import SilhouetteFrames as SilhouetteFrames
 from torchreg.capture.silhouettes import visual_hull as visual_hull
 from torchreg.capture.stereo import StereoConfig as StereoConfig
@@ -109,6 +111,7 @@ __all__ = [
     "Hand",
     "InitialPose",
     "LinearBlendSkin",
+    "MovedMasks",
     "PointCloud",
     "PoseHead",
     "PoseInitializer",
@@ -167,6 +170,7 @@ __all__ = [
     "load_points",
     "load_scan",
     "metrics",
+    "moved_masks",
     "plot",
     "register",
     "register_sequence",

@@ -171,7 +171,7 @@ def _waves(
 
 def _pair(kind: str, body: PosableBody, draw: Draw) -> MatchingPair | None:
     """Return a pair of scans of a body in two random poses; None where little of both is common."""
-    meshes = _two_poses(body, draw)
+    meshes = two_poses(body, draw)
     scans = _two_scans(body, meshes, draw)
     if scans is None:
         return None
@@ -199,7 +199,7 @@ def _pair(kind: str, body: PosableBody, draw: Draw) -> MatchingPair | None:
     )
 
 
-def _two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMesh]:
+def two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMesh]:
     """Return the surface in two poses of clips, or in a random one and after a motion from a few degrees to wild."""
     figure = body.figure
     from_clips = bool(body.clips) and draw.chance(_VARIETY.clip_share)

@@ -20,6 +20,7 @@ from torchreg.datasets.solids import mesh_of
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.visibility import rasterize
+from torchreg.geometry.z_buffer import Raster
 from torchreg.shapes.skin import LinearBlendSkin
 
 from ..made_up.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
@@ -195,12 +196,22 @@ def photographed(
 
     What lies behind the camera is left out.
     """
-    scene = joined(meshes)
-    kept = (scene.vertices[scene.faces][..., 2] > 0.05).all(-1)
-    camera = tr.Camera(WIDTH, HEIGHT, (FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1)))
-    raster = rasterize(TriangleMesh(scene.vertices, scene.faces[kept]), camera.view())
+    raster, _ = seen_faces(meshes)
     depth = torch.where(raster.face_index >= 0, raster.depth, 0.0).float()
-    return tr.DepthFrame(sensor.measured(averaged(depth, window), generator), camera)
+    return tr.DepthFrame(sensor.measured(averaged(depth, window), generator), camera())
+
+
+def camera() -> tr.Camera:
+    """Return the camera of all pictures, in its own coordinates."""
+    return tr.Camera(WIDTH, HEIGHT, (FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1)))
+
+
+def seen_faces(meshes: Sequence[TriangleMesh]) -> tuple[Raster, Tensor]:
+    """Return what the camera sees of meshes, and the number (H, W) of each face among all of them, -1 for none."""
+    scene = joined(meshes)
+    kept = (scene.vertices[scene.faces][..., 2] > 0.05).all(-1).nonzero()[:, 0]
+    raster = rasterize(TriangleMesh(scene.vertices, scene.faces[kept]), camera().view())
+    return raster, torch.where(raster.face_index >= 0, kept[raster.face_index.clamp_min(0)], -1)
 
 
 def averaged(depth: Tensor, radius: int, step: float = 0.03) -> Tensor:

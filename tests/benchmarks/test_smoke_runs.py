@@ -18,6 +18,7 @@ RUNS = [
         r"grid .*moments .*deform .*T-step, binary .*blended .*refine .*joints .*far .*drag ",
     ),
     ("depth_frames", "--smoke", r"cut: left out .*whole: left out.*clouds: 1 cases.*landmarks, both.*track, .*track, "),
+    ("depth_pairs", "--smoke", r"made up: 1 pairs, overlap 0\.[5-9].*whole .*moved .*true masks +registered"),
     ("depth_pictures", "--smoke", r"reprojection.*farthest from its pixel, px \(<= 0.5\) +(0\.[0-4]|\d\S*e-).*normals"),
     ("experiments", "--smoke --part overhead", r"overhead per trial.*finished, s +0.*pass"),
     ("experiments", "--smoke --part many", r"collect, s.*report, s.*both, s.*pass"),

@@ -200,8 +200,8 @@ class DepthFrame:
         outside = torch.zeros_like(self.measured) if self.mask is None else ~self.mask & self._clean
         # What is thinner than the radius is the rim of a mask that is not exact.
         outside = grown(~grown(~outside, radius), radius)
-        low = -_pooled(torch.where(outside, -self.depth, -torch.inf), radius + 1)
-        high = _pooled(torch.where(outside, self.depth, -torch.inf), radius + 1)
+        low = -pooled(torch.where(outside, -self.depth, -torch.inf), radius + 1)
+        high = pooled(torch.where(outside, self.depth, -torch.inf), radius + 1)
         step = _PICTURE.steepest * radius * self.depth / float(self.camera.intrinsics[:2].min())
         goes_on = (self.depth >= low - step) & (self.depth <= high + step)
         goes_on[[0, -1]], goes_on[:, [0, -1]] = True, True
@@ -222,8 +222,8 @@ class DepthFrame:
         return DepthFrame(self.depth, self.camera, both, max_points=self.max_points)
 
 
-def _pooled(picture: Tensor, radius: int) -> Tensor:
-    """Return the largest number of a picture (H, W) within some pixels of each."""
+def pooled(picture: Tensor, radius: int) -> Tensor:
+    """Return the largest number of a picture (H, W) within a radius, pixels, of each pixel."""
     found = torch.nn.functional.pad(picture, (radius,) * 4, value=-torch.inf)
     # Rows after columns, and the window doubled in each step: a square at once costs its whole area for each pixel.
     for axis in (0, 1):
@@ -238,7 +238,7 @@ def _pooled(picture: Tensor, radius: int) -> Tensor:
 
 def grown(mask: Tensor, radius: int) -> Tensor:
     """Return a mask (H, W) grown by some pixels."""
-    return _pooled(mask.float(), radius) > 0
+    return pooled(mask.float(), radius) > 0
 
 
 def _as_mask(mask: Any, depth: Tensor) -> Tensor:

@@ -29,13 +29,14 @@ class Segmentation:
     plane_band: float = 0.02  # within which points lie on one plane
     plane_width: float = 0.7  # from which on no part of the shape is so wide: a floor, a table, a wall
     max_planes: int = 4  # of a picture that are looked for
+    noisy: float = 4.0  # standard deviations of depths by which those of one surface may differ
 
 
 SEGMENTATION = Segmentation()
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
+class SurfaceGrid:
     """Every ``stride``-th pixel of a picture, and the graph of those on one surface."""
 
     frame: DepthFrame
@@ -43,13 +44,18 @@ class _Grid:
     pixels: Tensor
     points: Tensor
     graph: Graph
+    noise: float = 0.0
 
     @classmethod
-    def of(cls, frame: DepthFrame, size: float) -> _Grid:
+    def of(cls, frame: DepthFrame, size: float, noise: float = 0.0, most: int | None = None) -> SurfaceGrid:
+        """Return the grid, of ``most`` pixels if given, for a shape of some size and a deviation of depths, metres."""
+        reach = max(SEGMENTATION.step * size, SEGMENTATION.noisy * noise)
         depth = frame.depth * frame.measured
         middle = float(depth[depth > 0].median())
         focal = float(frame.camera.intrinsics[:2].mean())
         stride = max(1, round(SEGMENTATION.spacing * size * focal / middle))
+        if most is not None:
+            stride = max(stride, math.ceil(math.sqrt(depth.numel() / most)))
         coarse = depth[::stride, ::stride]
         pixels = coarse.nonzero()
         number = torch.full(coarse.shape, -1, dtype=torch.int64, device=depth.device)
@@ -60,28 +66,39 @@ class _Grid:
                 (number[:, :-1], number[:, 1:], coarse[:, 1:] - coarse[:, :-1]),
                 (number[:-1], number[1:], coarse[1:] - coarse[:-1]),
             )
-            if (joined := (first >= 0) & (second >= 0) & (step.abs() <= SEGMENTATION.step * size)) is not None
+            if (joined := (first >= 0) & (second >= 0) & (step.abs() <= reach)) is not None
         ]
         seen = stride * pixels.flip(-1)
         points = frame.camera.unproject(seen.double(), depth[seen[:, 1], seen[:, 0]].double())
         pairs = torch.cat(edges)
         lengths = (points[pairs[:, 0]] - points[pairs[:, 1]]).norm(dim=-1)
-        return cls(frame, stride, pixels, points, Graph.from_edges(pairs, lengths, len(pixels)))
+        return cls(frame, stride, pixels, points, Graph.from_edges(pairs, lengths, len(pixels)), noise)
 
-    def without_planes(self, size: float) -> _Grid:
-        """Return the grid without planes that are larger than a shape of some size: floors, tables, walls."""
+    def without_planes(self, size: float, wanted: Callable[[Tensor], bool] | None = None) -> SurfaceGrid:
+        """Return the grid without planes that are larger than a shape of some size: floors, tables, walls.
+
+        Planes whose nodes (K,) are ``wanted`` stay.
+        """
         kept, generator = torch.ones(len(self.points), dtype=torch.bool), torch.Generator().manual_seed(0)
         edges, lengths = self.graph.edges()
+        free, band = kept.clone(), max(SEGMENTATION.plane_band * size, SEGMENTATION.noisy * self.noise)
         for _ in range(SEGMENTATION.max_planes):
-            away = distance_to_plane(self.points[None], kept[None], SEGMENTATION.plane_band * size, generator)[0]
-            patch = _largest_patch(kept & (away < SEGMENTATION.plane_band * size), edges)
+            away = distance_to_plane(self.points[None], free[None], band, generator)[0]
+            patch = _largest_patch(free & (away < band), edges)
             if not len(patch) or _width(self.points[patch]) < SEGMENTATION.plane_width * size:
                 break
-            kept[patch] = False
+            free[patch] = False
+            if wanted is None or not wanted(patch):
+                kept[patch] = False
         number = kept.cumsum(0) - 1
         both = kept[edges].all(-1)
         graph = Graph.from_edges(number[edges[both]], lengths[both], int(kept.sum()))
         return replace(self, pixels=self.pixels[kept], points=self.points[kept], graph=graph)
+
+    def at(self, picture: Tensor) -> Tensor:
+        """Return the values (V, ...) of a picture (H, W, ...) at the nodes."""
+        row, column = (self.stride * self.pixels).unbind(-1)
+        return picture[row, column]
 
     def mask(self, kept: Tensor) -> Tensor:
         """Return the mask (H, W) of what some nodes (V,) stand for."""
@@ -98,7 +115,7 @@ def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFr
     A surface of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach
     of an end, along the surface. Planes that are larger than the shape show something else.
     """
-    grid = _Grid.of(frame, size).without_planes(size)
+    grid = SurfaceGrid.of(frame, size).without_planes(size)
     if not len(grid.points):
         return
     component = grid.graph.components().to(grid.points.device)
@@ -134,7 +151,7 @@ def _width(points: Tensor) -> float:
     return math.sqrt(12 * max(0.0, float(torch.linalg.eigvalsh(local.mT @ local / len(points))[1])))
 
 
-def _parts(grid: _Grid, index: Tensor, size: float) -> Iterator[Tensor]:
+def _parts(grid: SurfaceGrid, index: Tensor, size: float) -> Iterator[Tensor]:
     """Yield the nodes (V,) of a surface, or those around its ends, farthest from the picture's rim first."""
     every = torch.zeros(len(grid.points), dtype=torch.bool)
     every[index] = True
@@ -159,12 +176,12 @@ def _parts(grid: _Grid, index: Tensor, size: float) -> Iterator[Tensor]:
         yield every & (reached[number] <= SEGMENTATION.reach * size)
 
 
-def _distance(grid: _Grid, source: int, every: Tensor) -> Tensor:
+def _distance(grid: SurfaceGrid, source: int, every: Tensor) -> Tensor:
     """Return the distances (V,) of nodes from a source along the surface, -1 off it."""
     return torch.where(every, grid.graph.distances([source])[0], -1.0)
 
 
-def _rim_distance(grid: _Grid, nodes: list[int]) -> Tensor:
+def _rim_distance(grid: SurfaceGrid, nodes: list[int]) -> Tensor:
     """Return the distances of nodes from the rim of the picture, pixels of the grid."""
     height, width = grid.frame.depth[:: grid.stride, :: grid.stride].shape
     row, column = grid.pixels[nodes].unbind(-1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -59,7 +59,11 @@ def register(
     ] = None,
     depth_range: DepthRange = None,
     smoothing: Annotated[
-        float | None, typer.Option(min=0, help="Noise of depths at one metre, metres; depths are smoothed by it.")
+        float | None,
+        typer.Option(
+            min=0,
+            help="Noise of depths at one metre, metres, by which they are smoothed; by default that of the background",
+        ),
     ] = None,
     seen: Seen = None,
     scale: Annotated[
@@ -95,7 +99,8 @@ def register(
     With --urdf scans of a robot become its description: torchreg register S0 S1 S2 ... -o robot --urdf.
 
     With --depth A B --intrinsics FILE the scans are depth pictures in metres, steps cut and flying pixels left out.
-    What was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
+    The background, what did not move between them, is left out unless --support keep. What was kept of each goes to
+    OUT_seen, red where it was cut, and the moved source over the picture of the target.
 
     OMP_NUM_THREADS=2 in the environment makes a second core help to find where the source goes.
 
@@ -121,7 +126,7 @@ def register(
     check_used(depth, "--depth", views)
     if depth:
         folder = seen_folder(seen, output, force)
-        images, pair = _depth_pair(scans, intrinsics, depth_range, smoothing or 0.0, folder)
+        images, pair = _depth_pair(scans, intrinsics, depth_range, smoothing, support, folder)
     else:
         pair = read(2)
     if scene is not None and pair[0].faces is None:
@@ -149,15 +154,32 @@ def _check_unused(options: dict[str, Any]) -> None:
 
 
 def _depth_pair(
-    paths: list[Path], intrinsics: list[Path] | None, depths: tuple[float, float] | None, smoothing: float, folder: Path
-) -> tuple[list[_DepthImage], list[RangeScan]]:
+    paths: list[Path],
+    intrinsics: list[Path] | None,
+    depths: tuple[float, float] | None,
+    smoothing: float | None,
+    support: str,
+    folder: Path,
+) -> tuple[list[_DepthImage], Sequence[RangeScan]]:
     """Return depth images and their scans, and draw the depths that were kept."""
+    from torchreg.capture.depth import load_depth_scan
+    from torchreg.capture.depth_frame import DepthFrame
+    from torchreg.capture.moved import moved_scans
+
     if intrinsics is None or len(intrinsics) > 2:
         raise InputError("--depth takes --intrinsics FILE once, or twice where source and target have two cameras")
-    cameras = intrinsics[0], intrinsics[-1]
-    images = [_DepthImage.read(*pair) for pair in zip(paths, cameras, strict=True)]
-    kept = [folder / name for name in ("source.png", "target.png")]
-    return images, [image.scan(depths, smoothing, path) for image, path in zip(images, kept, strict=True)]
+    files = list(zip(paths, (intrinsics[0], intrinsics[-1]), strict=True))
+    images = [_DepthImage.read(*pair) for pair in files]
+    near, far = depths or (0.0, float("inf"))
+    pair: Sequence[RangeScan]
+    if support == "auto":
+        first, second = (DepthFrame.load(*names, nearest=near, farthest=far) for names in files)
+        pair = moved_scans(first, second, smoothing=smoothing)
+    else:
+        pair = [load_depth_scan(*names, smoothing=smoothing or 0.0, nearest=near, farthest=far) for names in files]
+    for image, scan, name in zip(images, pair, ("source.png", "target.png"), strict=True):
+        image.draw_kept(scan, folder / name)
+    return images, pair
 
 
 def _read(
@@ -178,7 +200,7 @@ def _read(
     ]
 
 
-def _registered(pair: list[RangeScan], bones: int, grid: int, support: str, quiet: bool) -> ScanRegistration:
+def _registered(pair: Sequence[RangeScan], bones: int, grid: int, support: str, quiet: bool) -> ScanRegistration:
     from tqdm import tqdm
 
     from torchreg.registration.register import register as run
@@ -225,8 +247,6 @@ def _show(bar: tqdm, record: RegisterRecord) -> None:
 class _DepthImage:
     """A depth image (H, W) from a file, metres, and its camera."""
 
-    path: Path
-    intrinsics: Path
     camera: Camera
     depth: Tensor
 
@@ -236,24 +256,20 @@ class _DepthImage:
         from torchreg.io.images import load_depth
 
         camera, scale = load_depth_camera(intrinsics)
-        return cls(path, intrinsics, camera, load_depth(path, scale, camera=camera))
+        return cls(camera, load_depth(path, scale, camera=camera))
 
-    def scan(self, depths: tuple[float, float] | None, smoothing: float, picture: Path) -> RangeScan:
-        """Return the scan, and draw the depths that were kept."""
+    def draw_kept(self, scan: RangeScan, picture: Path) -> None:
+        """Draw the depths that a scan has kept."""
         import torch
 
-        from torchreg.capture.depth import load_depth_scan
         from torchreg.io.images import save_image
         from torchreg.viz.seen import cut_picture
 
-        near, far = depths or (0.0, float("inf"))
-        found = load_depth_scan(self.path, self.intrinsics, smoothing=smoothing, nearest=near, farthest=far)
-        column, row = self.camera.project(found.points.double())[0].round().long().unbind(-1)
+        column, row = self.camera.project(scan.points.double())[0].round().long().unbind(-1)
         kept = torch.zeros(self.depth.shape, dtype=torch.bool)
         kept[row.clamp(0, self.camera.height - 1), column.clamp(0, self.camera.width - 1)] = True
         with OptionalOutput(picture):
             save_image(picture, cut_picture(self.depth, kept))
-        return found
 
     def draw_over(self, found: ScanRegistration, picture: Path) -> None:
         """Draw the moved source over this image, the target."""

@@ -21,6 +21,8 @@ from torchreg._checks import (
     warn_about_rounding,
 )
 from torchreg._threads import one_thread
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.moved import moved_scans
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin, to_local, to_world
 from torchreg.geometry.loaded import as_scan
@@ -80,7 +82,8 @@ def register(
     the CPU; the result has the dtype and device of the source.
 
     Args:
-        source: the scan to be moved, N points; or what a loader returns, a cloud or a mesh.
+        source: the scan to be moved, N points; or what a loader returns, a cloud or a mesh. Of two `DepthFrame`s
+            without masks, what moved between them is registered, see `moved_masks`.
         target: the scan to be reached, in the same frame and unit.
         num_bones: most bones; fewer where the motion needs no more, or the grid has fewer cells.
         grid_resolution: cells along the longest side of the source.
@@ -92,7 +95,7 @@ def register(
         parts: (N,) integers from zero, less than ``num_bones``, the parts from which bones start, such as the limbs of
             a spine, ``skeletonize(mesh).limb_of(source.points)``; by default patches that move as one.
         support: "auto" leaves out a table or a floor that a scanned thing stands on, see `split_support`, so that N is
-            the number of the other points; "keep" keeps it.
+            the number of the other points, and the background of two depth pictures; "keep" keeps them.
 
     Returns:
         a `ScanRegistration`.
@@ -105,7 +108,7 @@ def register(
     Warns:
         DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
         UnitsWarning: if one scan is more than seven times larger than the other, unless ``start`` is given.
-        FileWarning: if a support is left out.
+        FileWarning: if a support or a background is left out.
 
     Differentiable: no; `GridLBS` is, for refining what was found.
 
@@ -116,6 +119,9 @@ def register(
     """
     config = RegisterConfig() if config is None else config
     check_choice(support, "support", SUPPORTS)
+    if support == "auto" and isinstance(source, DepthFrame) and isinstance(target, DepthFrame):
+        # From the caller of `register` and its two decorators.
+        source, target = moved_scans(source, target, stacklevel=3)
     source, target = _checked_scans(source, target, num_bones, grid_resolution)
     _check_start(source, start, confidence, config)
     parts = _checked_parts(source, parts, num_bones, config)
