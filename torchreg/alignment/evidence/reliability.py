@@ -24,6 +24,7 @@ from torchreg.alignment.evidence.confidence import (
 from torchreg.alignment.evidence.curvature import curvature, plausible_precision
 from torchreg.alignment.evidence.observability import dof_confidence, far_variance, told_open
 from torchreg.alignment.evidence.other_explanations import open_rims, planes_instead
+from torchreg.alignment.evidence.picture_agreement import LIMB_MODEL, PICTURE_MODEL, picture_evidence
 from torchreg.alignment.fit.problem import AlignProblem, free_space_loss
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
@@ -32,6 +33,7 @@ from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.shaped import ShapedSkin
+from torchreg.solvers.calibration import Logistic
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ class Evidence:
         rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
         open_rim: square of `open_rims`; zero for clouds.
         planes: square of `planes_instead`.
+        elsewhere: probability by a picture that it shows something else, see `PictureModel`; zero for clouds.
     """
 
     noise: Tensor
@@ -60,6 +63,7 @@ class Evidence:
     rival_share: Tensor
     open_rim: Tensor
     planes: Tensor
+    elsewhere: Tensor
 
     def table(self) -> Tensor:
         """Return the numbers as (B, E)."""
@@ -79,7 +83,7 @@ _SCALES = _Scales()
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Logistic):
     """The logistic model of the confidence: log-odds of a right pose, ``bias - sum_k weight_k evidence_k``.
 
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
@@ -89,7 +93,19 @@ class Calibration:
     """
 
     bias: float = 5.35
-    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93, 20.44, 3.78)  # as `Evidence` has them
+    weights: tuple[float, ...] = (
+        1.36,
+        4.4,
+        8.69,
+        3.46,
+        8.53,
+        5.48,
+        1.03,
+        3.93,
+        20.44,
+        3.78,
+        4.0,
+    )  # as `Evidence` has them
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
@@ -101,7 +117,7 @@ CALIBRATION = Calibration()
 # `benchmarks/shape_confidence.py --calibrate` fits one to what it draws; its area under the curve on 72 others, a third
 # of them searched, is .96. Pictures and rivals were not among the 59: their weights are those of poses.
 SHAPE_CALIBRATION = Calibration(
-    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.44, 3.78), right=0.015
+    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.44, 3.78, 4.0), right=0.015
 )
 
 
@@ -177,12 +193,16 @@ def judge(
     rivals: Tensor | None = None,
 ) -> Judgement:
     """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`."""
-    residuals = SurfaceResiduals.of(problem, pose)
+    residuals, elsewhere = SurfaceResiduals.of(problem, pose), torch.zeros_like(pose[:, 0])
+    if pictures := picture_evidence(problem, pose, frames):
+        elsewhere = 1 - PICTURE_MODEL.probability(torch.stack([whole.table() for whole, _ in pictures]))
+        misplaced = 1 - LIMB_MODEL.probability(torch.stack([limbs.table() for _, limbs in pictures]))
+        residuals = replace(residuals, contradicted=misplaced)
     around, spreads = curvature(problem, pose, residuals), end_spreads(problem, pose, residuals)
     evidence, calibration = gather_evidence(problem, pose, residuals.distance, lead, spreads), CALIBRATION
     if frames:
         rims, planes = open_rims(problem, pose, frames), planes_instead(problem, residuals.distance)
-        evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
+        evidence = replace(evidence, open_rim=rims.square(), planes=planes.square(), elsewhere=elsewhere)
     converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
     if error is not None:
         evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
@@ -257,12 +277,13 @@ def weigh(
         rival_share=(-lead / (_SCALES.rival_share * count)).exp(),
         open_rim=torch.zeros_like(noise),
         planes=torch.zeros_like(noise),
+        elsewhere=torch.zeros_like(noise),
     )
 
 
 def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> Tensor:
     """Return the calibrated probabilities (B,) that poses with evidence (B, E) are right."""
-    return torch.sigmoid(calibration.bias - evidence @ evidence.new_tensor(calibration.weights))
+    return calibration.probability(evidence)
 
 
 def _turns(pose: Tensor, rivals: Tensor | None) -> list[str]:
@@ -304,6 +325,7 @@ _REASONS = (
     ("free_space", 0.2, "parts of the shape lie where the picture shows nothing"),
     ("open_rim", 0.25, "the surface goes on where the shape ends, as a wall or a table does"),
     ("planes", 0.2, "flat faces explain the data better than the shape"),
+    ("elsewhere", PICTURE_MODEL.told, "the picture more probably shows something else"),
 )
 
 
