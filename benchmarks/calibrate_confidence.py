@@ -37,8 +37,8 @@ from scenes import cases
 import torchreg as tr
 from experiments.made_up.rooms import KINDS, TRAINING_SEEDS
 from torchreg.alignment import pose_rows
-from torchreg.alignment.evidence import reliability
-from torchreg.alignment.evidence.picture_agreement import LimbModel, PictureModel, picture_evidence
+from torchreg.alignment.evidence import picture_agreement, reliability
+from torchreg.alignment.evidence.picture_agreement import LimbModel, PictureModel, picture_views
 from torchreg.alignment.evidence.reliability import Calibration
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.solvers.calibration import fit_logistic
@@ -52,7 +52,7 @@ class Judged:
     """What an alignment was judged by, and the truth.
 
     Args:
-        told: problem, pose, lead, frames and rivals, as `judge` takes them.
+        told: what `judge` takes: problem, pose, lead, error, frames, rivals, and whether it is a crop.
         ends: (L,) errors of the limbs' ends, metres; None where the shape is not there.
         right: whether the pose is right.
         near: whether it lies about on the shape.
@@ -80,9 +80,9 @@ def recorded(align: Callable[[], tr.AlignResult]) -> list[tuple[Any, ...]]:
     """Return what each judgement of an alignment was given, the answer's last."""
     calls = []
 
-    def judge(problem: Any, pose: Tensor, lead: Any, error: Any, frames: Any, rivals: Any) -> Any:
-        calls.append((problem, pose, lead, frames, rivals))
-        return reliability.judge(problem, pose, lead, error, frames, rivals)
+    def judge(problem: Any, pose: Tensor, lead: Any, error: Any, *told: Any) -> Any:
+        calls.append((problem, pose, lead, error, *told))
+        return reliability.judge(problem, pose, lead, error, *told)
 
     with patch.object(pose_rows, "judge", judge), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -103,7 +103,7 @@ def in_rooms(kind: str, seed: int, there: bool) -> Iterator[Judged]:
         if there and scene.keypoints is not None:
             ends = (scene.shape.keypoints(pose) - scene.keypoints)[4::4].norm(dim=-1)
         yield Judged(
-            kind=f"room, {kind}", family="robot" if kind == "arm" else "hand", seed=seed, told=told, ends=ends,
+            kind=f"room, {kind}", family="room", seed=seed, told=told, ends=ends,
             right=scene.is_right(pose), near=scene.is_near(pose, told[0].size), is_answer=told is calls[-1],
         )  # fmt: skip
 
@@ -124,8 +124,7 @@ def alone(thing: Subject, seed: int) -> Iterator[Judged]:
 def looked_at(cases: Sequence[Judged]) -> list[Judged]:
     """Return the cases with a picture, with how it agrees."""
     for case in cases:
-        problem, pose, _, frames, _ = case.told
-        case.views = picture_evidence(problem, pose, frames)
+        case.views = picture_views(*case.told[:2], case.told[4])
     return [case for case in cases if case.views]
 
 
@@ -149,10 +148,9 @@ def fitted_pictures(cases: Sequence[Judged]) -> PictureModel:
 
 def judge_again(cases: Sequence[Judged], limbs: LimbModel, pictures: PictureModel) -> None:
     """Gather the evidence of all cases by other models of pictures."""
-    with patch.multiple(reliability, LIMB_MODEL=limbs, PICTURE_MODEL=pictures), torch.inference_mode():
+    with patch.multiple(picture_agreement, LIMB_MODEL=limbs, PICTURE_MODEL=pictures), torch.inference_mode():
         for case in cases:
-            problem, pose, lead, frames, rivals = case.told
-            case.evidence = reliability.judge(problem, pose, lead, None, frames, rivals).evidence.table()[0].clone()
+            case.evidence = reliability.judge(*case.told).evidence.table()[0].clone()
 
 
 def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -43,7 +43,7 @@ _MISFIT = _Misfit()
 class SurfaceResiduals:
     """Distances (B, M) of data from the surface in some poses, metres, their Jacobian, and `limb_data` (B, L).
 
-    `contradicted` (B, L) is the probability by a picture that a limb is elsewhere.
+    `contradicted` (B, L) is the probability by a picture that a limb is elsewhere, as far as it counts.
     """
 
     distance: Tensor
@@ -104,10 +104,9 @@ def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Tensor:
     """Return the deviations (B, L) of the limbs' ends, metres; a limb without data of its own spreads by the prior."""
-    contradicted = 0.0 if residuals is None else residuals.contradicted
     if problem.data.shape[-2] > EVIDENCE.num_data:
         problem, residuals = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None
-    residuals = residuals or replace(SurfaceResiduals.of(problem, pose), contradicted=contradicted)
+    residuals = residuals or SurfaceResiduals.of(problem, pose)
     moves = end_motions(problem.skin, pose, limb_ends(problem.skin))
     # What the prior leaves free is plausible, at least.
     prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))

@@ -42,7 +42,7 @@ class PictureModel(Logistic):
     That is the logarithm of the Bayes factor, the odds in favor where as many poses are as are not. ``e`` is the table
     of `PictureAgreement`. Fitted to 213 alignments in crops of made-up rooms, of which 75 lie on a hand, also of other
     proportions and with things in it, or an arm: answers of the search, and fits from the truth and from poses off it.
-    ``benchmarks/scenes.py --calibrate`` draws such a mixture anew, not these very ones.
+    ``benchmarks/calibrate_confidence.py`` draws such a mixture anew, not these very ones.
     """
 
     bias: float = 5.16
@@ -55,10 +55,15 @@ PICTURE_MODEL = PictureModel()
 
 @dataclass(frozen=True)
 class LimbModel(Logistic):
-    """The logistic model of whether a limb is where it was fitted, by the table of `LimbViews`."""
+    """The logistic model of whether a limb is where it was fitted, by the table of `LimbViews`.
 
-    bias: float = 3.0
-    weights: tuple[float, ...] = (4.0, 2.0)  # as `LimbViews` has them
+    It is not if its end is off by more than a tenth of the shape's size. Fitted to fingers of hands in made-up rooms by
+    ``benchmarks/calibrate_confidence.py``.
+    """
+
+    bias: float = 3.1
+    weights: tuple[float, ...] = (5.31, 3.65)  # as `LimbViews` has them
+    level: float = 0.05  # probability of being elsewhere that the usual level of an ellipsoid leaves out
 
 
 LIMB_MODEL = LimbModel()
@@ -105,7 +110,7 @@ class PictureAgreement:
 
 
 @torch.no_grad()
-def picture_evidence(
+def picture_views(
     problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]
 ) -> list[tuple[PictureAgreement, LimbViews]]:
     """Return how frames, each a crop of its picture, agree with poses (B, num_dofs); nothing without a frame a pose."""
@@ -133,6 +138,30 @@ def _agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> tuple[
         uncovered=1 - look.confirmed.sum() / look.visible.sum().clamp_min(1),
     )
     return whole, look.limb_views(limb_points(problem.skin))
+
+
+@dataclass(frozen=True, eq=False)
+class PictureEvidence:
+    """Probabilities by pictures that they show something else (B,), and that limbs are elsewhere (B, L)."""
+
+    elsewhere: Tensor
+    misplaced: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> PictureEvidence | None:
+        """Return the evidence of frames about poses (B, num_dofs), None without a frame a pose."""
+        views = picture_views(problem, pose, frames)
+        if not views:
+            return None
+        return cls(
+            elsewhere=1 - PICTURE_MODEL.probability(torch.stack([whole.table() for whole, _ in views])),
+            misplaced=1 - LIMB_MODEL.probability(torch.stack([limbs.table() for _, limbs in views])),
+        )
+
+    @property
+    def contradicted(self) -> Tensor:
+        """The probability (B, L) that limbs are elsewhere, beyond the level that an ellipsoid leaves out anyway."""
+        return (self.misplaced - LIMB_MODEL.level).clamp_min(0) / (1 - LIMB_MODEL.level)
 
 
 @dataclass(frozen=True, eq=False)
