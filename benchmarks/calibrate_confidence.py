@@ -5,12 +5,13 @@
 
 Alignments are drawn as by confidence.py (clouds and cut pictures of hands, with SHARED a robot arm and a fox) and by
 scenes.py, on seeds that neither measures: hands among other things, hands that hold things, arms, and rooms without
-them. In a room every crop that is tried counts, not the answer alone. Whatever judges an alignment is kept, so that
-each is judged again by models fitted before it:
+them. In a room every crop that is tried counts, not the answer alone. What each is judged by is kept, so that it
+is judged again by the models fitted before it:
 
 1. `LimbModel`: whether the end of a limb is off by at most a tenth of the shape's size, where most limbs are right;
 2. `PictureModel`: whether a pose lies about on the shape, at even odds before;
-3. `Calibration`: whether a pose is right, by the evidence that uses both; a bias for each family.
+3. `Calibration`: whether a pose is right, by the evidence that uses both; in rooms, and elsewhere with a bias for each
+   family of shapes.
 
 The table is of models of poses fitted to the other cases, five times without a fifth of the seeds.
 """
@@ -38,12 +39,14 @@ import torchreg as tr
 from experiments.made_up.rooms import KINDS, TRAINING_SEEDS
 from torchreg.alignment import pose_rows
 from torchreg.alignment.evidence import picture_agreement, reliability
+from torchreg.alignment.evidence.confidence import limb_data
 from torchreg.alignment.evidence.picture_agreement import LimbModel, PictureModel, picture_views
 from torchreg.alignment.evidence.reliability import Calibration
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.solvers.calibration import fit_logistic
 
-FOLDS, MISPLACED, ABOUT, BIAS_STD = 5, 0.1, 0.15, 1.0
+FOLDS, MISPLACED, ABOUT, BIAS_STD, ROOM = 5, 0.1, 0.15, 1.0, "room"
+LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed to doubt it
 FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
 
 
@@ -103,7 +106,7 @@ def in_rooms(kind: str, seed: int, there: bool) -> Iterator[Judged]:
         if there and scene.keypoints is not None:
             ends = (scene.shape.keypoints(pose) - scene.keypoints)[4::4].norm(dim=-1)
         yield Judged(
-            kind=f"room, {kind}", family="room", seed=seed, told=told, ends=ends,
+            kind=f"room, {kind}", family=ROOM, seed=seed, told=told, ends=ends,
             right=scene.is_right(pose), near=scene.is_near(pose, told[0].size), is_answer=told is calls[-1],
         )  # fmt: skip
 
@@ -129,10 +132,14 @@ def looked_at(cases: Sequence[Judged]) -> list[Judged]:
 
 
 def limb_rows(cases: Sequence[Judged]) -> tuple[Tensor, Tensor]:
-    """Return the views (N, E) of limbs, and whether each is about where it was fitted (N,), in poses mostly right."""
-    told = [case for case in cases if case.ends is not None and float(case.ends.median()) <= MISPLACED * case.size]
-    table = torch.cat([case.views[0][1].table() for case in told])
-    return table, torch.cat([case.ends <= MISPLACED * case.size for case in told])
+    """Return the views (N, E) of limbs with data, in poses mostly right, and whether each is in place (N,)."""
+    views, right = [], []
+    for case in cases:
+        if case.ends is not None and float(case.ends.median()) <= MISPLACED * case.size:
+            told = limb_data(*case.told[:2])[0] > LIMB_DATA
+            views.append(case.views[0][1].table()[told])
+            right.append((case.ends <= MISPLACED * case.size)[told])
+    return torch.cat(views), torch.cat(right)
 
 
 def fitted_limbs(cases: Sequence[Judged]) -> LimbModel:
@@ -154,18 +161,25 @@ def judge_again(cases: Sequence[Judged], limbs: LimbModel, pictures: PictureMode
 
 
 def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
-    """Return the model of whether a pose is right of each family: weights are those of all, the bias is its own.
+    """Return the model of whether a pose is right of each family; rooms have weights of their own, too."""
+    rooms = [case for case in cases if case.family == ROOM]
+    return by_family(rooms) | by_family([case for case in cases if case.family != ROOM])
+
+
+def by_family(cases: Sequence[Judged]) -> dict[str, Calibration]:
+    """Return a model of each family: the weights are those of all, the bias is its own.
 
     A family's bias is off the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
     """
+    if not cases:
+        return {}
     table, right = torch.stack([case.evidence for case in cases if case.evidence is not None]).double(), rights(cases)
-    common = fit_logistic(table, right)
-    found = {}
+    common, found = fit_logistic(table, right), {}
     for family in dict.fromkeys(case.family for case in cases):
         chosen = torch.tensor([case.family == family for case in cases])
-        offsets = torch.linspace(-4, 4, 161, dtype=torch.float64)
-        odds = common.log_odds(table[chosen]) + offsets.unsqueeze(-1)
-        likelihood = -torch.nn.functional.softplus(torch.where(right[chosen], -odds, odds)).sum(-1)
+        offsets = torch.linspace(-4, 4, 161, dtype=torch.float64).unsqueeze(-1)
+        odds = common.log_odds(table[chosen]) + offsets
+        likelihood = -torch.nn.functional.softplus(torch.where(right[chosen], -odds, odds)).sum(-1, keepdim=True)
         offset = float(offsets[(likelihood - 0.5 * (offsets / BIAS_STD).square()).argmax()])
         found[family] = Calibration(bias=round(common.bias + offset, 2), weights=common.weights)
     return found
@@ -218,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=200, help="clouds and cut pictures")
     parser.add_argument("--smoke", action="store_true", help="a few of each")
     given = parser.parse_args(arguments)
-    rooms, count = (2, 6) if given.smoke else (given.rooms, given.count)
+    rooms, count = (1, 6) if given.smoke else (given.rooms, given.count)
     found = list(drawn(None if given.smoke else given.data, rooms, count))
     pictured = looked_at(found)
     limbs, pictures = fitted_limbs(pictured), fitted_pictures(pictured)

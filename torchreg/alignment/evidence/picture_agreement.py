@@ -57,8 +57,8 @@ PICTURE_MODEL = PictureModel()
 class LimbModel(Logistic):
     """The logistic model of whether a limb is where it was fitted, by the table of `LimbViews`.
 
-    It is not if its end is off by more than a tenth of the shape's size. Fitted to fingers of hands in made-up rooms by
-    ``benchmarks/calibrate_confidence.py``.
+    It is not if its end is off by more than a tenth of the shape's size. Fitted by
+    ``benchmarks/calibrate_confidence.py`` to 127 fingers of hands in made-up rooms.
     """
 
     bias: float = 3.1
