@@ -1,7 +1,6 @@
 """How far the confidence and the covariance of an alignment can be trusted, on made-up data.
 
     python benchmarks/confidence.py --data SHARED              # reliability on data not used to calibrate
-    python benchmarks/confidence.py --data SHARED --calibrate  # fits the model anew, also to halves and without a kind
     python benchmarks/confidence.py --data SHARED --only arm --count 30
     python benchmarks/confidence.py --diagram FILE.png         # draws the reliability beside
     python benchmarks/confidence.py --smoke                    # a few alignments, to see that it runs
@@ -27,7 +26,7 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -40,7 +39,7 @@ import torchreg as tr
 from experiments.made_up.depth_noise import DepthNoise
 from experiments.made_up.shape_sequences import other_hand
 from torchreg.alignment.evidence.confidence import limb_ends
-from torchreg.alignment.evidence.reliability import CALIBRATION, Calibration, Evidence, confidence_of
+from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.datasets.hand import make_hand_cloud, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import compose_rotation_vectors
@@ -52,7 +51,7 @@ SEARCHED, OTHER, PICTURES, CUT, STRETCHED, WHOLE = 0.67, 0.7, 0.5, 0.3, 0.3, 0.4
 SENSORS = (DepthNoise.structured_light(), DepthNoise.time_of_flight(), DepthNoise(quadratic=1e-3, jitter=0.3))
 OTHER_SCALES = (0.05, 0.05, 0.1, 0.1, 0.15)
 FOCAL, WIDTH, HEIGHT = 475.0, 320, 240
-RIDGE, EPOCHS, BINS, HANDS = 0.0015, 200, 10, 8
+BINS, HANDS = 10, 8
 
 
 @dataclass(frozen=True)
@@ -206,45 +205,70 @@ def ends_of(shape: tr.ArticulatedShape, surface: tr.LinearBlendSkin, pose: Tenso
         return surface(pose)[limb_ends(surface)] if not isinstance(shape, tr.Hand) else shape.keypoints(pose)[4::4]
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """A drawn case: its kind and data, the start of the alignment or None, the true pose and the shape measured."""
+
+    kind: str
+    data: object
+    start: Tensor | None
+    pose: Tensor
+    truth: tr.ArticulatedShape
+
+    @classmethod
+    def of(cls, thing: Subject, seed: int) -> Drawn:
+        """Return the case of a seed."""
+        generator = torch.Generator().manual_seed(seed)
+        kind, data, pose, truth = observed(thing, generator)
+        searched = float(torch.rand((), generator=generator)) < thing.searched
+        return cls(kind, data, None if searched else turned(pose, thing.shape, generator), pose, truth)
+
+    def end_errors(self, thing: Subject, pose: Tensor) -> Tensor:
+        """Return how far the ends of the limbs are off in a pose, (L,) metres."""
+        found, true = ends_of(thing.shape, thing.skin, pose), ends_of(self.truth, thing.skin, self.pose)
+        return (found - true).norm(dim=-1)
+
+
 def measure(thing: Subject, seed: int) -> Case:
     """Return a case, drawn by a seed."""
-    generator = torch.Generator().manual_seed(seed)
-    kind, data, pose, truth = observed(thing, generator)
-    searched = float(torch.rand((), generator=generator)) < thing.searched
-    start = None if searched else turned(pose, thing.shape, generator)
+    drawn = Drawn.of(thing, seed)
     begin = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = tr.align(thing.shape, data, start, model_points=thing.skin)
+        found = tr.align(thing.shape, drawn.data, drawn.start, model_points=thing.skin)
     seconds = time.process_time() - begin
-    surface = thing.skin
-    error = (ends_of(thing.shape, surface, found.pose) - ends_of(truth, surface, pose)).norm(dim=-1).mean()
-    off = difference(found.pose[None], pose[None])[0].double()
+    error = drawn.end_errors(thing, found.pose).mean()
+    off = difference(found.pose[None], drawn.pose[None])[0].double()
     deviation = off @ torch.linalg.solve(found.covariance.double(), off)
     # That a Gaussian of that covariance is no farther off than the truth: 95 % of the time it is within the ellipsoid.
     inside = torch.special.gammainc(torch.tensor(0.5 * len(off), dtype=torch.float64), 0.5 * deviation) <= 0.95
     return Case(
-        kind=kind, searched=searched, status=found.status, error=float(error) / thing.size, evidence=found.evidence,
-        confidence=float(found.confidence), covered=bool(inside), seconds=seconds, seed=seed, pose=found.pose,
+        kind=drawn.kind, searched=drawn.start is None, status=found.status, error=float(error) / thing.size,
+        evidence=found.evidence, confidence=float(found.confidence), covered=bool(inside), seconds=seconds, seed=seed,
+        pose=found.pose,
     )  # fmt: skip
 
 
+def turns(things: Sequence[Subject]) -> list[Subject]:
+    """Return subjects in the order in which seeds draw them, hands eight times as often as each other one."""
+    return [thing for thing in things for _ in range(HANDS if thing.name == "hand" else 1)]
+
+
 def collect(things: Sequence[Subject], seeds: Sequence[int], kept: Path | None = None) -> list[Case]:
-    """Return cases of some seeds of all subjects, hands eight times as often as each other one.
+    """Return cases of some seeds of all subjects.
 
     Args:
         things: subjects.
         seeds: of the cases.
         kept: file of measured cases, which are not measured again; new ones are added.
     """
-    turns = [thing for thing in things for _ in range(HANDS if thing.name == "hand" else 1)]
-    known = {}
+    order, known = turns(things), {}
     if kept is not None and kept.exists():
         known = {case.seed: case for case in torch.load(kept, weights_only=False)}
     for number, seed in enumerate(tqdm(seeds, desc="alignments", leave=False, disable=None)):
         if seed in known:
             continue
-        known[seed] = measure(turns[seed % len(turns)], seed)
+        known[seed] = measure(order[seed % len(order)], seed)
         if kept is not None and (number % 10 == 9 or seed == seeds[-1]):
             torch.save(list(known.values()), kept)
     return [known[seed] for seed in seeds]
@@ -252,32 +276,6 @@ def collect(things: Sequence[Subject], seeds: Sequence[int], kept: Path | None =
 
 def is_right(cases: Sequence[Case]) -> Tensor:
     return torch.tensor([case.error <= CALIBRATION.right for case in cases])
-
-
-def fitted_model(evidence: Tensor, right: Tensor, prior: Tensor | None = None) -> tuple[float, tuple[float, ...]]:
-    """Return bias and weights of the logistic model of highest likelihood, the weights not negative, with a ridge.
-
-    Args:
-        evidence: (N, E).
-        right: (N,) bool.
-        prior: (N,) weights of the cases; all alike by default.
-    """
-    table = torch.cat([torch.ones(len(evidence), 1, dtype=torch.float64), -evidence.double()], dim=1)
-    weights = torch.full((table.shape[1],), 0.5, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.LBFGS([weights], max_iter=EPOCHS, line_search_fn="strong_wolfe")
-
-    def loss() -> Tensor:
-        optimizer.zero_grad()
-        kept = torch.cat([weights[:1], torch.nn.functional.softplus(weights[1:])])
-        odds = table @ kept
-        value = torch.nn.functional.binary_cross_entropy_with_logits(odds, right.double(), prior)
-        value = value + RIDGE * kept[1:].square().mean()
-        value.backward()
-        return value
-
-    optimizer.step(loss)
-    kept = torch.nn.functional.softplus(weights.detach()[1:])
-    return float(weights.detach()[0]), tuple(round(float(weight), 2) for weight in kept)
 
 
 def area_under_curve(confidence: Tensor, right: Tensor) -> float:
@@ -320,52 +318,6 @@ def reliability(cases: Sequence[Case]) -> list[str]:
         span = f"{least:.2f} to {most:.2f}  {near}"
         lines.append(f"{low:4.1f} to {low + 1 / BINS:3.1f}  {count:6} {mean:6.2f} {share:6.2f}  {span}")
     return lines
-
-
-def as_calibrated(cases: Sequence[Case], calibration: Calibration) -> list[Case]:
-    """Return cases with the confidence, and what follows from it, of another calibration."""
-    table = torch.stack([case.evidence for case in cases]).double()
-    sure = confidence_of(table, calibration).tolist()
-    return [
-        replace(case, confidence=value, status=_status_of(case.status, value, calibration))
-        for case, value in zip(cases, sure, strict=True)
-    ]
-
-
-def _status_of(status: tr.Status, confidence: float, calibration: Calibration) -> tr.Status:
-    """Return the status of a case of another confidence; of one that was doubtful it is not known, but mostly this."""
-    if status.usable or status is tr.Status.DOUBTFUL:
-        was_sure = tr.Status.CONVERGED if status is tr.Status.DOUBTFUL else status
-        return tr.Status.DOUBTFUL if confidence < calibration.doubtful else was_sure
-    return status
-
-
-def calibrated(cases: Sequence[Case]) -> Calibration:
-    bias, weights = fitted_model(torch.stack([case.evidence for case in cases]), is_right(cases))
-    return replace(CALIBRATION, bias=round(bias, 2), weights=weights)
-
-
-def crossed(cases: Sequence[Case]) -> list[Case]:
-    """Return all cases with the confidence of a model that was calibrated to the other half of them, even or odd."""
-    even, odd = (cases[start::2] for start in (0, 1))
-    return [*as_calibrated(even, calibrated(odd)), *as_calibrated(odd, calibrated(even))]
-
-
-def left_out(cases: Sequence[Case]) -> str:
-    """Return the tables of each kind of cases, by the model that was calibrated without that kind."""
-    told: list[Case] = []
-    lines = []
-    for kind in sorted({case.kind for case in cases}):
-        others = calibrated([case for case in cases if case.kind != kind])
-        held_out = as_calibrated([case for case in cases if case.kind == kind], others)
-        area = area_under_curve(confidences(held_out), is_right(held_out))
-        mean, share = float(confidences(held_out).mean()), float(is_right(held_out).double().mean())
-        lines.append(
-            f"calibrated without {kind:8}: {len(held_out):4} cases, mean confidence {mean:.2f}, right {share:.2f}, "
-            f"area under the curve {area:.2f}"
-        )
-        told += held_out
-    return "\n".join([*lines, "these together", *reliability(told)])
 
 
 def draw(cases: Sequence[Case], file: Path) -> None:
@@ -417,9 +369,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
     parser.add_argument("--count", type=int, default=200, help="alignments")
     parser.add_argument("--only", choices=("hand", "arm", "fox"), help="alignments of one shape alone")
-    parser.add_argument(
-        "--calibrate", action="store_true", help="fit the model anew: to all, to halves, and without each kind"
-    )
     parser.add_argument("--diagram", type=Path, help="picture of the reliability to be written")
     parser.add_argument("--kept", type=Path, help="file of measured cases, to go on with; of this version only")
     parser.add_argument("--smoke", action="store_true", help="four alignments")
@@ -430,13 +379,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     things = [thing for thing in subjects(data) if options.only in (None, thing.name)]
     count = 4 if options.smoke else options.count
     cases = collect(things, range(count), options.kept)
-    if options.calibrate:
-        calibration = calibrated(cases)
-        names = [item.name for item in fields(Evidence)]
-        weights = ", ".join(f"{name} {weight}" for name, weight in zip(names, calibration.weights, strict=True))
-        print(f"{count} cases: bias {calibration.bias:.2f}, {weights}", left_out(cases), sep="\n")
-        print("each half by a model calibrated to the other")
-        cases = crossed(cases)
     print(render(cases))
     if options.diagram is not None:
         draw(cases, options.diagram)

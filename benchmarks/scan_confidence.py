@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from confidence import area_under_curve, fitted_model
+from confidence import area_under_curve
 from scan_matching import Pair, held_out, known, moved_points
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -28,6 +28,7 @@ from torchreg.registration.dense.align_scans import align_problem
 from torchreg.registration.dense.config import ScanAlignConfig, ScanEvidence
 from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.reliability import confidence_of
+from torchreg.solvers.calibration import fit_logistic
 
 NEAR, SHARE, FIFTHS = 0.025, 0.9, 5
 
@@ -91,8 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.calibrate:
         cases = aligned(training_kinds(5 * count))
         table = torch.stack([case.evidence.table() for case in cases])
-        bias, weights = fitted_model(table, torch.tensor([case.right for case in cases]))
-        print(f"bias {bias:.2f}, weights {weights}")
+        print(fit_logistic(table, torch.tensor([case.right for case in cases])))
         print(report("the pairs it was fitted to", cases))
     print(report("kinds never trained on", aligned(held_out(count))))
     if options.data is None:

@@ -2,7 +2,6 @@
 
     python benchmarks/scenes.py                         # 32 pictures of each kind, some minutes
     python benchmarks/scenes.py --kinds held --list     # of one kind, scene by scene
-    python benchmarks/scenes.py --calibrate --count 160 # on other seeds: fits the model of whole pictures
     python benchmarks/scenes.py --smoke                 # two pictures, to see that it runs
 
 Each picture is drawn, see `experiments.made_up.rooms`: a camera looks onto a table before a wall, with crates, cans and
@@ -24,23 +23,17 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
-from confidence import area_under_curve, fitted_model
+from confidence import area_under_curve
 
 import torchreg as tr
-from experiments.made_up.rooms import KINDS, TRAINING_SEEDS, Scene
-from torchreg.alignment.evidence.picture_agreement import PictureAgreement, PictureModel
-from torchreg.alignment.fit.problem import model_size
-from torchreg.capture.depth_segments import candidate_crops
-
-MOST_CROPS = 4  # of a picture that the model is fitted to
+from experiments.made_up.rooms import KINDS, Scene
 
 
 @dataclass(frozen=True)
@@ -65,7 +58,7 @@ class Row:
         return f"{self.scene.kind:5} {self.seed:4} {truth:6} {found} {self.status.name:12} {self.confidence:.2f}"
 
 
-def cases(kinds: Sequence[str], count: int, start: int) -> Iterator[tuple[str, int, bool]]:
+def cases(kinds: Sequence[str], count: int, start: int = 0) -> Iterator[tuple[str, int, bool]]:
     """Yield kind, seed and whether the shape is there; hands have even seeds, arms odd ones."""
     for number in range(count):
         seeds = {"hand": 2 * number, "arm": 2 * number + 1}
@@ -83,31 +76,6 @@ def measure(kind: str, seed: int, there: bool) -> Row:
         scene=scene, seed=seed, right=scene.is_right(found.pose), status=found.status,
         confidence=float(found.confidence), seconds=time.process_time() - begin,
     )  # fmt: skip
-
-
-def crop_cases(kind: str, seed: int, there: bool) -> Iterator[tuple[Tensor, bool]]:
-    """Yield the agreement (E,) of poses found in the first crops of a picture, and whether they lie on the shape.
-
-    Where the shape is in a crop, it is also fitted from the true pose.
-    """
-    scene = KINDS[kind](seed, there)
-    skin, quick = tr.sample_skin(scene.shape), tr.AlignConfig(search="never")
-    near = replace(quick, schedule=tr.SigmaSchedule.geometric(0.008, 0.004, 2))
-    crops = [crop for surface in candidate_crops(scene.frame, model_size(skin)) for crop in surface]
-    starts = [(None, quick)] + [(scene.pose, near)] * there
-    for crop in crops[:MOST_CROPS]:
-        for start, config in starts:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                pose = tr.align(scene.shape, crop, start, model_points=skin, config=config).pose
-            yield PictureAgreement.of(skin, pose, crop).table(), scene.is_near(pose, model_size(skin))
-
-
-def calibrated(rows: Sequence[tuple[Tensor, bool]]) -> PictureModel:
-    """Return the model of highest likelihood on crops, at even odds before."""
-    near = torch.tensor([row[1] for row in rows])
-    bias, weights = fitted_model(torch.stack([row[0] for row in rows]), near)
-    return PictureModel(round(bias - float(near.double().mean().logit()), 2), weights)
 
 
 def render(rows: Sequence[Row]) -> str:
@@ -138,15 +106,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=32, help="pictures of each kind")
     parser.add_argument("--kinds", nargs="+", choices=tuple(KINDS), default=list(KINDS), help="of scenes")
     parser.add_argument("--list", action="store_true", help="print every scene, too")
-    parser.add_argument("--calibrate", action="store_true", help="fit the model of whole pictures")
     parser.add_argument("--smoke", action="store_true", help="two pictures")
     given = parser.parse_args(arguments)
     count, kinds = (2, ["hand"]) if given.smoke else (given.count, given.kinds)
-    chosen = list(cases(kinds, count, TRAINING_SEEDS if given.calibrate else 0))
+    chosen = list(cases(kinds, count))
     bar = tqdm(chosen, desc="pictures", leave=False, disable=None)
-    if given.calibrate:
-        print(calibrated([row for case in bar for row in crop_cases(*case)]))
-        return 0
     rows = []
     for case in bar:
         rows.append(measure(*case))

@@ -20,13 +20,14 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 import torch
-from confidence import area_under_curve, fitted_model
+from confidence import area_under_curve
 from shape_fit import MARGIN, Person, error_mm, fit, load_model, make_person, start_pose
 from torch import Tensor
 
 import torchreg as tr
 from torchreg.alignment.evidence.reliability import SHAPE_CALIBRATION
 from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.solvers.calibration import fit_logistic
 
 # Sizes of the mean ones, metres.
 SIZES, FIRST_SEED = {"body": 1.9, "hand.R": 0.246}, 1000
@@ -105,8 +106,7 @@ def left_out(evidence: Tensor, right: Tensor) -> Tensor:
     found = []
     for number in range(len(evidence)):
         others = torch.arange(len(evidence)) != number
-        bias, weights = fitted_model(evidence[others], right[others])
-        found.append(torch.sigmoid(bias - evidence[number].double() @ torch.tensor(weights, dtype=torch.float64)))
+        found.append(fit_logistic(evidence[others], right[others]).probability(evidence[number].double()))
     return torch.stack(found)
 
 
@@ -135,10 +135,7 @@ def report(cases: Sequence[Case], calibrate: bool) -> bool:
     confidence = torch.tensor([case.confidence for case in cases])
     if calibrate:
         evidence = torch.stack([case.evidence for case in cases])[:, TOLD].double()
-        bias, weights = fitted_model(evidence, right)
-        print(
-            f"bias {bias:.2f}, weights {weights} of beside, clusters, off, unknown, rivals; each by the others' model:"
-        )
+        print(f"{fit_logistic(evidence, right)} of beside, clusters, off, unknown, rivals; each by the others' model:")
         confidence = left_out(evidence, right)
     met = True
     for kind in SIZES:

@@ -131,7 +131,7 @@ def align(
         skin = task.skin()
 
         def aligned(crop: DepthFrame, *, config: AlignConfig) -> AlignResult:
-            return _aligned(replace(task, model_points=skin, config=config), crop, **options)
+            return _aligned(replace(task, model_points=skin, config=config, in_picture=True), crop, **options)
 
         return align_in_picture(data, skin, aligned, config, partial(source.crop_score, skin))
     return _aligned(task, data, mask, **options)

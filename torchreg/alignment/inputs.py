@@ -167,7 +167,10 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What `align` or `find_pose` is asked for, see there; ``seen`` follows once a picture is cropped."""
+    """What `align` or `find_pose` is asked for, see there; ``seen`` follows once a picture is cropped.
+
+    ``in_picture``: whether it is sought in a whole picture, of which this is a crop that may show something else.
+    """
 
     shape: ArticulatedShape
     source: StartSource
@@ -178,6 +181,7 @@ class Task:
     fit_shape: bool = False
     clothed: bool | str = False
     support: str = "keep"
+    in_picture: bool = False
     on_step: OnStep | None = None
     seen: Observation = Observation(None, None)
 

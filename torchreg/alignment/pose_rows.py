@@ -176,7 +176,7 @@ class PoseRows:
         # What lies off the surface tells nothing of the pose, unless all does.
         told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
         degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=4)
-        judgement = judge(self.uncropped, pose, self.lead, error, seen.frames, rivals)
+        judgement = judge(self.uncropped, pose, self.lead, error, seen.frames, rivals, self.task.in_picture)
         confidence = torch.where(degenerate, 0.0, judgement.confidence)
         converged = self.found.change <= config.pose_atol
         converged = converged | judgement.converged if config.surface_steps or error is not None else converged

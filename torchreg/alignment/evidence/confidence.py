@@ -41,16 +41,24 @@ _MISFIT = _Misfit()
 
 @dataclass(frozen=True, eq=False)
 class SurfaceResiduals:
-    """Distances (B, M) of data from the surface in some poses, metres, their Jacobian, and `limb_data` (B, L)."""
+    """Distances (B, M) of data from the surface in some poses, metres, their Jacobian, and `limb_data` (B, L).
+
+    `contradicted` (B, L) is the probability by a picture that a limb is elsewhere, as far as it counts.
+    """
 
     distance: Tensor
     jacobian: Tensor
     limb_data: Tensor
+    contradicted: Tensor | float = 0.0
 
     @classmethod
     def of(cls, problem: AlignProblem, pose: Tensor) -> SurfaceResiduals:
         """Return how the data of a batch lie in poses (B, num_dofs)."""
         return cls(*problem.surface.distance_jacobian(problem.data, pose), limb_data(problem, pose))
+
+    def misplaced(self, count: float) -> Tensor:
+        """Return the probability (B, L) that a limb is anywhere, 1 / e without a picture if ``count`` data show it."""
+        return 1 - (1 - (-self.limb_data / count).exp()) * (1 - self.contradicted)
 
 
 def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
@@ -107,8 +115,8 @@ def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals
     loose = (moves.square() * variances[..., None, None, :]).sum((-2, -1))
     covariance = _covariance(problem, pose, residuals, prior)
     fitted = end_variances(moves, covariance)
-    alone = (-residuals.limb_data / EVIDENCE.limb_data).exp()
-    return (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
+    misplaced = residuals.misplaced(EVIDENCE.limb_data)
+    return (fitted + misplaced * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
 
 
 def end_motions(skin: LinearBlendSkin, pose: Tensor, ends: Tensor) -> Tensor:

@@ -85,7 +85,7 @@ def curvature(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals |
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
-    misplaced = torch.diag_embed(_misplaced_share(problem, residuals.limb_data) / precision)
+    misplaced = torch.diag_embed(_misplaced_share(problem, residuals.misplaced(_ERRORS.limb_data)) / precision)
     return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, noise, shared)
 
 
@@ -131,12 +131,11 @@ def hardly_gains(
     return _gain(problem, pose, distance, jacobian, noise, covariance) / shared <= _ERRORS.gain
 
 
-def _misplaced_share(problem: AlignProblem, limb_data: Tensor) -> Tensor:
-    """Return the probability (B, num_dofs) that a joint is anywhere: that of a limb which hardly any data show."""
+def _misplaced_share(problem: AlignProblem, misplaced: Tensor) -> Tensor:
+    """Return the probability (B, num_dofs) that a joint is anywhere: that of its limb (B, L)."""
     share = torch.zeros_like(problem.prior.mean)
-    missing = (-limb_data / _ERRORS.limb_data).exp()
     for column, (limb, _) in enumerate(limb_points(problem.skin)):
-        share[:, limb.dofs] = missing[:, column : column + 1]
+        share[:, limb.dofs] = misplaced[:, column : column + 1]
     return share
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit.problem import AlignProblem, centered_problem
+from torchreg.alignment.evidence.confidence import limb_points
+from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.geometry.normals import fit_normals
-from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.limbs import Limb
+from torchreg.solvers.calibration import Logistic
 
 
 @dataclass(frozen=True)
@@ -34,25 +36,54 @@ _LOOK = _Look()
 
 
 @dataclass(frozen=True)
-class PictureModel:
+class PictureModel(Logistic):
     """The logistic model of whether a picture shows a shape about where a pose is: ``bias - sum_k weight_k e_k``.
 
     That is the logarithm of the Bayes factor, the odds in favor where as many poses are as are not. ``e`` is the table
     of `PictureAgreement`. Fitted to 213 alignments in crops of made-up rooms, of which 75 lie on a hand, also of other
     proportions and with things in it, or an arm: answers of the search, and fits from the truth and from poses off it.
-    ``benchmarks/scenes.py --calibrate`` draws such a mixture anew, not these very ones.
+    ``benchmarks/calibrate_confidence.py`` draws such a mixture anew, not these very ones.
     """
 
     bias: float = 5.16
     weights: tuple[float, ...] = (0.86, 0.97, 4.59, 1.47, 1.74)  # as `PictureAgreement` has them
-    against: float = 0.24  # probability below which there is substantial evidence against, 1 / (1 + sqrt(10)): Jeffreys
-
-    def probability(self, agreement: Tensor) -> Tensor:
-        """Return the probability (...) that the shape is there, by agreements (..., E), at even odds before."""
-        return torch.sigmoid(self.bias - agreement @ agreement.new_tensor(self.weights))
+    told: float = 0.76  # probability of something else, from which on the evidence is substantial: Jeffreys
 
 
 PICTURE_MODEL = PictureModel()
+
+
+@dataclass(frozen=True)
+class LimbModel(Logistic):
+    """The logistic model of whether a limb is where it was fitted, by the table of `LimbViews`.
+
+    It is not if its end is off by more than a tenth of the shape's size. Fitted by
+    ``benchmarks/calibrate_confidence.py`` to 127 fingers of hands in made-up rooms.
+    """
+
+    bias: float = 3.1
+    weights: tuple[float, ...] = (5.31, 3.65)  # as `LimbViews` has them
+    level: float = 0.05  # probability of being elsewhere that the usual level of an ellipsoid leaves out
+
+
+LIMB_MODEL = LimbModel()
+
+
+@dataclass(frozen=True, eq=False)
+class LimbViews:
+    """How a picture speaks against the limbs of a pose, (..., L) each, as shares of a limb's visible surface.
+
+    Args:
+        behind: through which the picture shows something farther.
+        hidden: that is not confirmed for another reason: something nearer, or no depth.
+    """
+
+    behind: Tensor
+    hidden: Tensor
+
+    def table(self) -> Tensor:
+        """Return the numbers as (..., L, E)."""
+        return torch.stack([getattr(self, item.name) for item in fields(self)], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +108,60 @@ class PictureAgreement:
         """Return the numbers as (E,)."""
         return torch.stack([getattr(self, item.name) for item in fields(self)])
 
-    @classmethod
-    @torch.no_grad()
-    def of(cls, skin: LinearBlendSkin, pose: Tensor, frame: DepthFrame) -> PictureAgreement:
-        """Return how a frame, a crop of the picture, agrees with a pose (num_dofs,) of a skin's shape."""
-        origin = frame.points.double().mean(0)
-        frame = frame.near(origin)
-        data, pose = frame.points[None].to(skin.points), shifted(pose[None].double(), -origin[None]).to(skin.points)
-        valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-        problem = centered_problem(skin, data, valid, pose, data.new_zeros(1, 3), prior_std=None, pose_atol=0.0)
-        look = _Surface.of(problem, pose, frame)
-        normals, relief, smooth = _normal_agreement(problem, pose, frame)
-        return cls(
-            behind=look.share(look.gap > _LOOK.on_shape),
-            normals=1 - normals,
-            relief=1 - relief,
-            smooth=smooth.clamp(0, _LOOK.smoothest),
-            uncovered=1 - look.confirmed.sum() / look.visible.sum().clamp_min(1),
+
+@torch.no_grad()
+def picture_views(
+    problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]
+) -> list[tuple[PictureAgreement, LimbViews]]:
+    """Return how frames, each a crop of its picture, agree with poses (B, num_dofs); nothing without a frame a pose."""
+    if len(frames) != len(pose):
+        return []
+    return [
+        _agreement(
+            problem.rows(torch.tensor([row], device=pose.device)),
+            pose[row, None],
+            frame.near(problem.origin[row].double()),
         )
+        for row, frame in enumerate(frames)
+    ]
+
+
+def _agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> tuple[PictureAgreement, LimbViews]:
+    """Return how a frame agrees with a pose (1, num_dofs), whole and by limbs, in the problem's coordinates."""
+    look = _Surface.of(problem, pose, frame)
+    normals, relief, smooth = _normal_agreement(problem, pose, frame)
+    whole = PictureAgreement(
+        behind=look.share(look.gap > _LOOK.on_shape),
+        normals=1 - normals,
+        relief=1 - relief,
+        smooth=smooth.clamp(0, _LOOK.smoothest),
+        uncovered=1 - look.confirmed.sum() / look.visible.sum().clamp_min(1),
+    )
+    return whole, look.limb_views(limb_points(problem.skin))
+
+
+@dataclass(frozen=True, eq=False)
+class PictureEvidence:
+    """Probabilities by pictures that they show something else (B,), and that limbs are elsewhere (B, L)."""
+
+    elsewhere: Tensor
+    misplaced: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> PictureEvidence | None:
+        """Return the evidence of frames about poses (B, num_dofs), None without a frame a pose."""
+        views = picture_views(problem, pose, frames)
+        if not views:
+            return None
+        return cls(
+            elsewhere=1 - PICTURE_MODEL.probability(torch.stack([whole.table() for whole, _ in views])),
+            misplaced=1 - LIMB_MODEL.probability(torch.stack([limbs.table() for _, limbs in views])),
+        )
+
+    @property
+    def contradicted(self) -> Tensor:
+        """The probability (B, L) that limbs are elsewhere, beyond the level that an ellipsoid leaves out anyway."""
+        return (self.misplaced - LIMB_MODEL.level).clamp_min(0) / (1 - LIMB_MODEL.level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +196,17 @@ class _Surface:
     def confirmed(self) -> Tensor:
         """Which points lie where the picture has a surface, (N,)."""
         return self.known & (self.gap.abs() <= _LOOK.on_shape)
+
+    def limb_views(self, limbs: Sequence[tuple[Limb, Tensor]]) -> LimbViews:
+        """Return how the picture speaks against limbs, with the indices of their points; one of zeros without limbs."""
+        if not limbs:
+            return LimbViews(*self.gap.new_zeros(2, 1))
+        behind = self.known & (self.gap > _LOOK.on_shape)
+        hidden = self.visible & ~behind & ~self.confirmed
+        counts = torch.stack([
+            torch.stack([which[index].sum() for which in (behind, hidden, self.visible)]) for _, index in limbs
+        ]).to(self.gap)  # fmt: skip
+        return LimbViews(*(counts[:, :2] / counts[:, 2:].clamp_min(1)).unbind(-1))
 
     def share(self, which: Tensor) -> Tensor:
         """Return the share () of the measured points that are some (N,)."""

@@ -6,17 +6,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
-import torch
-
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureAgreement
 from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import candidate_crops
 from torchreg.result import Status
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin
 
 
 @dataclass(frozen=True)
@@ -50,14 +47,10 @@ def align_in_picture(
     All crops are aligned without a search around the result; then the most probable one with it, if it is in doubt.
     NOT_FOUND where even the most probable pose is hardly right.
     """
-
-    def answer(settings: AlignConfig, crop: DepthFrame) -> AlignResult:
-        return judged(aligned(crop, config=settings), crop, skin)
-
     quick = replace(config, search="never")
-    found, crop = surest_crop(frame, model_size(skin), lambda crop: answer(quick, crop), crop_score)
+    found, crop = surest_crop(frame, model_size(skin), lambda crop: aligned(crop, config=quick), crop_score)
     if _confidence(found) < CHOICE.sure and config.search != "never" and found.coefficients is None:
-        found = answer(config, crop)
+        found = aligned(crop, config=config)
     return replace(_not_found_if_improbable(found), crop=crop.mask)
 
 
@@ -83,20 +76,6 @@ def surest_crop(
         return best
     everything = frame.cropped(frame.measured)
     return answer(everything), everything
-
-
-def judged(found: AlignResult, crop: DepthFrame, skin: LinearBlendSkin) -> AlignResult:
-    """Return the alignment to a crop of a picture, in doubt where `PICTURE_MODEL` says that something else is there."""
-    if found.shape is not None and found.coefficients is not None:
-        skin = sample_skin(found.shape)
-    there = float(PICTURE_MODEL.probability(PictureAgreement.of(skin, found.pose, crop).table()))
-    if there >= PICTURE_MODEL.against:
-        return found
-    reason = f"what the picture shows there looks like the shape with a probability of {there:.1%}"
-    status = Status.DOUBTFUL if found.statuses[0].usable else found.status
-    doubt = "; ".join(filter(None, (reason, str(found.doubt))))
-    confidence = torch.as_tensor(found.confidence).clamp_max(there)
-    return replace(found, confidence=confidence, status=status, doubt=doubt)
 
 
 def _not_found_if_improbable(found: AlignResult) -> AlignResult:

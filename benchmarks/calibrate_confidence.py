@@ -1,0 +1,246 @@
+"""Fits the models of an alignment's confidence: limbs in pictures, whole pictures, and poses by family.
+
+    python benchmarks/calibrate_confidence.py --data SHARED --rooms 80 --count 200   # prints all models; hours
+    python benchmarks/calibrate_confidence.py --smoke                                  # to see that it runs
+
+Alignments are drawn as by confidence.py (clouds and cut pictures of hands, with SHARED a robot arm and a fox) and by
+scenes.py, on seeds that neither measures: hands among other things, hands that hold things, arms, and rooms without
+them. In a room every crop that is tried counts, not the answer alone. What each is judged by is kept, so that it
+is judged again by the models fitted before it:
+
+1. `LimbModel`: whether the end of a limb is off by at most a tenth of the shape's size, where most limbs are right;
+2. `PictureModel`: whether a pose lies about on the shape, at even odds before;
+3. `Calibration`: whether a pose is right, by the evidence that uses both; in rooms, and elsewhere with a bias for each
+   family of shapes.
+
+The table is of models of poses fitted to the other cases, five times without a fifth of the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).parent))
+from confidence import Drawn, Subject, area_under_curve, subjects, turns
+from scenes import cases
+
+import torchreg as tr
+from experiments.made_up.rooms import KINDS, TRAINING_SEEDS
+from torchreg.alignment import pose_rows
+from torchreg.alignment.evidence import picture_agreement, reliability
+from torchreg.alignment.evidence.confidence import limb_data
+from torchreg.alignment.evidence.picture_agreement import LimbModel, PictureModel, picture_views
+from torchreg.alignment.evidence.reliability import Calibration
+from torchreg.shapes.pose_algebra import shifted
+from torchreg.solvers.calibration import fit_logistic
+
+FOLDS, MISPLACED, ABOUT, BIAS_STD, ROOM = 5, 0.1, 0.15, 1.0, "room"
+LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed to doubt it
+FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
+
+
+@dataclass
+class Judged:
+    """What an alignment was judged by, and the truth.
+
+    Args:
+        told: what `judge` takes: problem, pose, lead, error, frames, rivals, and whether it is a crop.
+        ends: (L,) errors of the limbs' ends, metres; None where the shape is not there.
+        right: whether the pose is right.
+        near: whether it lies about on the shape.
+        is_answer: whether it is what `align` returned.
+    """
+
+    kind: str
+    family: str
+    seed: int
+    told: tuple[Any, ...]
+    ends: Tensor | None
+    right: bool
+    near: bool
+    is_answer: bool
+    views: list[Any] = field(default_factory=list)
+    evidence: Tensor | None = None
+
+    @property
+    def size(self) -> float:
+        """Of the shape, metres."""
+        return float(self.told[0].size)
+
+
+def recorded(align: Callable[[], tr.AlignResult]) -> list[tuple[Any, ...]]:
+    """Return what each judgement of an alignment was given, the answer's last."""
+    calls = []
+
+    def judge(problem: Any, pose: Tensor, lead: Any, error: Any, *told: Any) -> Any:
+        calls.append((problem, pose, lead, error, *told))
+        return reliability.judge(problem, pose, lead, error, *told)
+
+    with patch.object(pose_rows, "judge", judge), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        align()
+    return calls
+
+
+def world_pose(told: tuple[Any, ...]) -> Tensor:
+    return shifted(told[1], told[0].origin)[0]
+
+
+def in_rooms(kind: str, seed: int, there: bool) -> Iterator[Judged]:
+    """Yield all judgements of a room."""
+    scene = KINDS[kind](seed, there)
+    calls = recorded(lambda: tr.align(scene.shape, scene.frame))
+    for told in calls:
+        pose, ends = world_pose(told), None
+        if there and scene.keypoints is not None:
+            ends = (scene.shape.keypoints(pose) - scene.keypoints)[4::4].norm(dim=-1)
+        yield Judged(
+            kind=f"room, {kind}", family=ROOM, seed=seed, told=told, ends=ends,
+            right=scene.is_right(pose), near=scene.is_near(pose, told[0].size), is_answer=told is calls[-1],
+        )  # fmt: skip
+
+
+def alone(thing: Subject, seed: int) -> Iterator[Judged]:
+    """Yield the judgement of a cloud or cut picture of one shape."""
+    drawn = Drawn.of(thing, seed)
+    calls = recorded(lambda: tr.align(thing.shape, drawn.data, drawn.start, model_points=thing.skin))
+    pose = world_pose(calls[-1])
+    ends = drawn.end_errors(thing, pose)
+    right = float(ends.mean()) <= reliability.CALIBRATION.right * thing.size
+    yield Judged(
+        kind=drawn.kind, family={"arm": "robot", "fox": "rig"}.get(thing.name, "hand"), seed=seed, told=calls[-1],
+        ends=ends, right=right, near=float(ends.mean()) <= ABOUT * thing.size, is_answer=True,
+    )  # fmt: skip
+
+
+def looked_at(cases: Sequence[Judged]) -> list[Judged]:
+    """Return the cases with a picture, with how it agrees."""
+    for case in cases:
+        case.views = picture_views(*case.told[:2], case.told[4])
+    return [case for case in cases if case.views]
+
+
+def limb_rows(cases: Sequence[Judged]) -> tuple[Tensor, Tensor]:
+    """Return the views (N, E) of limbs with data, in poses mostly right, and whether each is in place (N,)."""
+    views, right = [], []
+    for case in cases:
+        if case.ends is not None and float(case.ends.median()) <= MISPLACED * case.size:
+            told = limb_data(*case.told[:2])[0] > LIMB_DATA
+            views.append(case.views[0][1].table()[told])
+            right.append((case.ends <= MISPLACED * case.size)[told])
+    return torch.cat(views), torch.cat(right)
+
+
+def fitted_limbs(cases: Sequence[Judged]) -> LimbModel:
+    return LimbModel(**vars(fit_logistic(*limb_rows(cases))))
+
+
+def fitted_pictures(cases: Sequence[Judged]) -> PictureModel:
+    """Return the model of whether a pose lies about on the shape, at even odds before."""
+    near = torch.tensor([case.near for case in cases])
+    model = fit_logistic(torch.stack([case.views[0][0].table() for case in cases]), near)
+    return PictureModel(bias=round(model.bias - float(near.double().mean().logit()), 2), weights=model.weights)
+
+
+def judge_again(cases: Sequence[Judged], limbs: LimbModel, pictures: PictureModel) -> None:
+    """Gather the evidence of all cases by other models of pictures."""
+    with patch.multiple(picture_agreement, LIMB_MODEL=limbs, PICTURE_MODEL=pictures), torch.inference_mode():
+        for case in cases:
+            case.evidence = reliability.judge(*case.told).evidence.table()[0].clone()
+
+
+def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
+    """Return the model of whether a pose is right of each family; rooms have weights of their own, too."""
+    rooms = [case for case in cases if case.family == ROOM]
+    return by_family(rooms) | by_family([case for case in cases if case.family != ROOM])
+
+
+def by_family(cases: Sequence[Judged]) -> dict[str, Calibration]:
+    """Return a model of each family: the weights are those of all, the bias is its own.
+
+    A family's bias is off the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
+    """
+    if not cases:
+        return {}
+    table, right = torch.stack([case.evidence for case in cases if case.evidence is not None]).double(), rights(cases)
+    common, found = fit_logistic(table, right), {}
+    for family in dict.fromkeys(case.family for case in cases):
+        chosen = torch.tensor([case.family == family for case in cases])
+        offsets = torch.linspace(-4, 4, 161, dtype=torch.float64).unsqueeze(-1)
+        odds = common.log_odds(table[chosen]) + offsets
+        likelihood = -torch.nn.functional.softplus(torch.where(right[chosen], -odds, odds)).sum(-1, keepdim=True)
+        offset = float(offsets[(likelihood - 0.5 * (offsets / BIAS_STD).square()).argmax()])
+        found[family] = Calibration(bias=round(common.bias + offset, 2), weights=common.weights)
+    return found
+
+
+def rights(cases: Sequence[Judged]) -> Tensor:
+    return torch.tensor([case.right for case in cases])
+
+
+def crossed(cases: Sequence[Judged]) -> Tensor:
+    """Return the confidence (N,) in each case by models of poses that were fitted without a fifth of the seeds."""
+    found = torch.zeros(len(cases), dtype=torch.float64)
+    for fold in range(FOLDS):
+        models = fitted_poses([case for case in cases if case.seed % FOLDS != fold])
+        for number, case in enumerate(cases):
+            if case.seed % FOLDS == fold:
+                found[number] = models[case.family].probability(case.evidence.double())
+    return found
+
+
+def render(cases: Sequence[Judged], sure: Tensor) -> str:
+    """Return area and calibration of the answers' confidence (N,) by family and by kind of scene."""
+    lines = []
+    for name in ("family", "kind"):
+        for value in dict.fromkeys(getattr(case, name) for case in cases):
+            chosen = torch.tensor([getattr(case, name) == value and case.is_answer for case in cases])
+            right, mine = rights(cases)[chosen], sure[chosen]
+            is_sure = mine >= reliability.CALIBRATION.doubtful
+            lines.append(
+                f"{value:12} {len(mine):4} answers: mean confidence {float(mine.mean()):.2f}, right "
+                f"{float(right.double().mean()):.2f}, area under the curve {area_under_curve(mine, right):.2f}; sure "
+                f"{int(is_sure.sum())}, {int((is_sure & ~right).sum())} of them wrong"
+            )
+    return "\n".join(lines)
+
+
+def drawn(data: Path | None, rooms: int, count: int) -> Iterator[Judged]:
+    """Yield all judgements of some rooms of each kind, and of clouds and cut pictures."""
+    for case in tqdm(list(cases(tuple(KINDS), rooms, TRAINING_SEEDS)), desc="rooms", leave=False, disable=None):
+        yield from in_rooms(*case)
+    things = turns(subjects(data))
+    for seed in tqdm(range(FIRST_SEED, FIRST_SEED + count), desc="alone", leave=False, disable=None):
+        yield from alone(things[seed % len(things)], seed)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
+    parser.add_argument("--rooms", type=int, default=80, help="pictures of each kind of room")
+    parser.add_argument("--count", type=int, default=200, help="clouds and cut pictures")
+    parser.add_argument("--smoke", action="store_true", help="a few of each")
+    given = parser.parse_args(arguments)
+    rooms, count = (1, 6) if given.smoke else (given.rooms, given.count)
+    found = list(drawn(None if given.smoke else given.data, rooms, count))
+    pictured = looked_at(found)
+    limbs, pictures = fitted_limbs(pictured), fitted_pictures(pictured)
+    judge_again(found, limbs, pictures)
+    print(render(found, crossed(found)))
+    print(limbs, pictures, fitted_poses(found), sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

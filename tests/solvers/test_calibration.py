@@ -1,0 +1,28 @@
+"""Logistic models that are fitted to cases."""
+
+import pytest
+import torch
+
+from torchreg.solvers.calibration import Logistic, fit_logistic
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_model_is_that_by_which_the_cases_were_drawn(weighted):
+    generator = torch.Generator().manual_seed(0)
+    evidence = torch.rand(4000, 3, generator=generator)
+    truth = Logistic(2.0, (4.0, 0.0, 1.0))
+    right = torch.rand(4000, generator=generator) < truth.probability(evidence)
+    weights = None
+    if weighted:
+        # Cases without weight do not count, whatever they say.
+        weights = torch.cat((torch.ones(4000), torch.zeros(4000)))
+        evidence, right = evidence.repeat(2, 1), torch.cat((right, ~right))
+    found = fit_logistic(evidence, right, weights)
+    assert found.bias == pytest.approx(truth.bias, abs=0.4)
+    assert found.weights == pytest.approx(truth.weights, abs=0.6)
+    torch.testing.assert_close(found.log_odds(evidence).sigmoid(), found.probability(evidence))
+
+
+def test_evidence_that_speaks_for_what_it_should_speak_against_has_no_weight():
+    evidence = torch.rand(500, 1, generator=torch.Generator().manual_seed(0))
+    assert fit_logistic(evidence, evidence[:, 0] > 0.5).weights == (pytest.approx(0, abs=0.02),)
