@@ -7,7 +7,8 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 - the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
 - the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `Candidates`, `Plan`;
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
-  measured keypoints: `MeasuredKeypoints`, `keypoint_skin`; recursive shape coefficients: `PersonFilter`, `KnownPerson`;
+  measured keypoints: `MeasuredKeypoints`, `keypoint_skin`;
+- shape coefficients: `fitted_rig`, `scan_normals`, `surface_skins`, `plausible_precision`, `robust_rows`;
 - what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `near_outlier_share`, `limb_ends`,
   `end_motions`, `end_variances`, `dof_confidence`, `SurfaceError`; in words `spread_of`;
 - checks of input: `check_skin`, `floating_origin`, `warn_about_units`, `warn_about_degenerate`;

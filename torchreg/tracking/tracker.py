@@ -15,13 +15,11 @@ from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_ab
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.landmarks import MeasuredKeypoints
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
-from torchreg.alignment.shape.person_filter import KnownPerson, PersonFilter
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import to_local, to_world
@@ -30,12 +28,13 @@ from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.config import TrackConfig
-from torchreg.tracking.evidence import deviates_far, is_doubtful, is_supported, is_unreliable, update_means
+from torchreg.tracking.evidence import is_continuous, is_doubtful, is_supported, is_unreliable, update_means
 from torchreg.tracking.frame import MIN_DATA, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.frame_result import fitted_result, predicted_result, track_result
 from torchreg.tracking.model_points import next_model_points
 from torchreg.tracking.motion_model import advance_clock, decayed_velocity, restart_motion, update_motion
+from torchreg.tracking.person_filter import KnownPerson, PersonFilter
 from torchreg.tracking.recovery import Recovery, after_search
 from torchreg.tracking.results import FrameResult, TrackResult, TrackState
 
@@ -208,8 +207,6 @@ class Tracker:
                     fit, state = self._recover(state, frame, view, fit)
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
-                if self._person is not None and fit is not None and result.statuses[0].usable:
-                    state = _learned(self._person, state, frame, fit)
             self._state = normal_copy(state)
             found = normal_copy(replace(
                 result, coefficients=state.coefficients, coefficient_covariance=state.coefficient_covariance
@@ -288,7 +285,7 @@ class Tracker:
             return
         self.shape, self._followed = self._person.rig.with_coefficients(coefficients), coefficients
         with torch.no_grad():
-            self._fitter = FrameFitter(self.shape, self.config, None)
+            self._fitter = FrameFitter(self.shape, self.config, None, self._person)
             self._recover = Recovery(self._fitter, StartSource.of(self.shape, upright=self.config.upright))
 
     def _follow_closer(self) -> None:
@@ -412,16 +409,17 @@ class Tracker:
         if fit is None:
             return self._hold(state, frame, Status.LOST)
         covariance, observed = self._fitter.covariance(fit)
-        error = None if self._person is None else _surface_error(self._person, state, frame, fit)
-        result = fitted_result(self._fitter, state, frame, fit, covariance, error)
-        after = self._state_after(state, frame, fit, observed)
-        return result, replace(after, sure=after.sure or result.statuses[0].usable)
+        result = fitted_result(self._fitter, state, frame, fit, covariance)
+        after, usable = self._state_after(state, frame, fit, observed), result.statuses[0].usable
+        if fit.person is not None:
+            after = _with_person(after, fit.person.known if usable else None)
+        return result, replace(after, sure=after.sure or usable)
 
     def _state_after(self, state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
         """Return the state after a fit, of whose degrees of freedom data tell the observed share (num_dofs,)."""
         found, pose = fit.acquired == "found", fit.world_pose
         after = update_means(state, fit, len(frame.data))
-        if state.tracked and state.lost == 0 and not found and not deviates_far(fit, state):
+        if is_continuous(fit, state):
             after = update_motion(after, frame, fit, observed)
         else:
             after = restart_motion(after, self._fitter.size)
@@ -442,32 +440,14 @@ class Tracker:
         """Return the result of a frame without a fit, at the predicted pose, and the state after it."""
         pose = self._fitter.predict(state, frame.elapsed)
         after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
+        after = _with_person(after, None)
         return predicted_result(self._fitter, state, frame, pose, status), after
 
 
-def _surface_error(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> SurfaceError | None:
-    """Return the errors of a person's surface in a fit to a frame; None where no coefficients are known."""
-    known = _known_person(state)
+def _with_person(state: TrackState, known: KnownPerson | None) -> TrackState:
+    """Return the state with what is known of a person; without it, only the coefficients of before are."""
     if known is None:
-        return None
-    return person.surface_error(known, fit.view.problem.data[0], fit.pose[0], fit.last_step[0], _viewpoint(frame, fit))
-
-
-def _learned(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> TrackState:
-    """Return the state with what a fit to a frame tells of the coefficients."""
-    known = _known_person(state)
-    if known is None:
-        return state
-    known = person.update(known, fit.view.problem.data[0], fit.pose[0], _viewpoint(frame, fit))
-    return replace(state, coefficients=known.coefficients, coefficient_covariance=known.covariance)
-
-
-def _known_person(state: TrackState) -> KnownPerson | None:
-    if state.coefficients is None or state.coefficient_covariance is None:
-        return None
-    return KnownPerson(state.coefficients, state.coefficient_covariance)
-
-
-def _viewpoint(frame: Frame, fit: FrameFit) -> Tensor | None:
-    """Return where a picture was taken (3,), in the coordinates of a fit's view."""
-    return None if frame.picture is None else frame.picture.camera.position - fit.view.origin
+        return replace(state, person_covariance=None)
+    return replace(
+        state, coefficients=known.coefficients, coefficient_covariance=known.alone, person_covariance=known.covariance
+    )  # fmt: skip
