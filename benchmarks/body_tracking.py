@@ -101,7 +101,9 @@ def seen_from(camera: Tensor, mesh: tr.TriangleMesh, noise: float, count: int, g
 def captured(path: Path, frames: int) -> Clip:
     """Return a captured person, who stands along y: frames of a mesh, or of meshes with nothing in common."""
     with np.load(path) as file:
-        arrays = {name: torch.from_numpy(file[name].astype(np.int64 if "face" in name else None)) for name in file}
+        arrays = {
+            name: torch.from_numpy(file[name].astype(np.float64 if name == "vertices" else np.int64)) for name in file
+        }
     if "vertex_counts" in arrays:
         vertices = arrays["vertices"].split(arrays["vertex_counts"].tolist())
         faces = arrays["faces"].split(arrays["face_counts"].tolist())

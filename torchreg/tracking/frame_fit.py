@@ -115,7 +115,7 @@ class FrameFitter:
             self._template, skin=skin or self.skin, data=data[None],
             valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
-            prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
+            prior=GaussianPosePrior(local[None], self.joint_precision(FILTER.max_joint_std)),
             factors=self._factors(frame, skin or self.skin, origin, num_in_reach / len(data)),
         )  # fmt: skip
         if frame.known is not None:
@@ -248,7 +248,7 @@ class FrameFitter:
         unexplained = self.clusters.find(problem.data[0], distance[0], residual)
         moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
         intruding = free_space_loss(problem, pose)
-        wide_prior = GaussianPosePrior(problem.prior.mean, self._joint_precision(FILTER.max_joint_std))
+        wide_prior = GaussianPosePrior(problem.prior.mean, self.joint_precision(FILTER.max_joint_std))
         return FrameFit(
             view=view, pose=pose, distance=distance, jacobian=fitted.jacobian, transforms=transforms,
             residual=residual, last_step=fitted.last_step,
@@ -259,7 +259,7 @@ class FrameFitter:
             deviation=float(moved.quantile(_SETTINGS.deviation_quantile)), acquired=acquired,
         )  # fmt: skip
 
-    def _joint_precision(self, std: float) -> Tensor:
+    def joint_precision(self, std: float) -> Tensor:
         """Return the prior's precision (num_dofs,) for a standard deviation of the joints; zero for the base."""
         return self._template.prior.precision / std**2
 
@@ -267,7 +267,7 @@ class FrameFitter:
         """Return the prior about the prediction, the base included: few data may not turn it away."""
         prior = problem.prior
         shift, turn, joints = prediction_std(state, elapsed, self.size, self.config.prior_std).tolist()
-        precision = self._joint_precision(joints)
+        precision = self.joint_precision(joints)
         precision[:3], precision[3:6] = shift**-2, turn**-2
         if problem.prior_precision is not None:
             precision = torch.where(problem.prior_precision[0] > 0, prior.precision, precision)

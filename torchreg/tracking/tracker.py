@@ -33,7 +33,7 @@ from torchreg.tracking.frame import MIN_DATA, Frame, FrameFit, FrameView, frame_
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.frame_result import fitted_result, predicted_result, track_result
 from torchreg.tracking.model_points import next_model_points
-from torchreg.tracking.motion_model import advance_clock, decayed_velocity, restart_motion, update_motion
+from torchreg.tracking.motion_model import advance_clock, decayed_velocity, initial_state, restart_motion, update_motion
 from torchreg.tracking.person_filter import KnownPerson, PersonFilter
 from torchreg.tracking.recovery import Recovery, after_search
 from torchreg.tracking.results import FrameResult, TrackResult, TrackState
@@ -111,7 +111,7 @@ class Tracker:
             pose = self._checked_pose(initial_pose)
             # In full precision, for clouds far from the origin.
             self._start = pose if initial_pose is None else torch.as_tensor(initial_pose, dtype=torch.float64)
-            self._state = self._initial_state(pose)
+            self._state = initial_state(self._fitter.skin, pose, self.config.seed)
         self._locked = locked
         KnownDofs.of(shape, locked, None)
 
@@ -350,16 +350,6 @@ class Tracker:
         if not math.isfinite(time) or (self._state.frame > 0 and time <= latest):
             raise InputError(f"time must be finite and later than the frame before at {latest:g}, got {time}")
 
-    def _initial_state(self, pose: Tensor) -> TrackState:
-        skin = self._fitter.skin
-        return TrackState(
-            frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=skin.points,
-            weights=skin.weights, reference_pose=skin.reference_pose, keyframes=pose[None][:0],
-            unexplained=skin.points[:0], prediction_error=0.0, innovation=skin.points.new_zeros(3), num_data=0.0,
-            num_inliers=0.0, ratio_in_reach=0.0, residual=0.0, limit_share=0.0, lost=0, cool_down=0, failed_searches=0,
-            pending_checks=0, seed=self.config.seed, sure=False,
-        )  # fmt: skip
-
     def _rejection(self, data: Tensor) -> Status | None:
         """Return the status of data (M, 3) that no pose can be fitted to; None for others."""
         if len(data) < MIN_DATA:
@@ -402,7 +392,9 @@ class Tracker:
         """Return a state as before the first fit, at the same frame."""
         names = ["frame", "time", "interval", "origin", "coefficients", "coefficient_covariance", "person", "lost"]
         kept = {name: getattr(state, name) for name in names}
-        return replace(self._initial_state(torch.full_like(state.pose, torch.nan)), **kept)
+        return replace(
+            initial_state(self._fitter.skin, torch.full_like(state.pose, torch.nan), self.config.seed), **kept
+        )
 
     def _accept(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame with the best fit that was found, and the state after it."""
