@@ -138,7 +138,7 @@ class _Smoother:
 
     def __init__(self, fitter: FrameFitter, track: TrackResult, given: _Given) -> None:
         self.fitter, self.track, self.given = fitter, track, given
-        self.state = initial_state(fitter.skin, fitter.shape.rest, 0)
+        self.state = initial_state(fitter.skin, fitter.shape.rest, fitter.config.seed)
 
     def __call__(self, poses: Tensor, stretch: slice) -> tuple[Tensor, Tensor]:
         """Return the poses (R, num_dofs) and their deviations from the tracked ones."""
