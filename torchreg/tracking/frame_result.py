@@ -65,7 +65,8 @@ def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose:
         fitter, state, frame, pose=pose, registered=fitter.skin(pose), keypoints=fitter.shape.keypoints(pose),
         distances=distances, posterior=torch.zeros_like(distances), sigma=unknown, cost=unknown,
         covariance=unknown.expand(len(pose), len(pose)).clone(), status=status,
-        acquired="lost" if status is Status.LOST else "held", residual=math.nan, confidence=torch.zeros_like(unknown),
+        acquired="lost" if status in (Status.LOST, Status.NOT_FOUND) else "held",
+        residual=math.nan, confidence=torch.zeros_like(unknown),
         dof_confidence=torch.zeros_like(pose),
     )  # fmt: skip
 

@@ -36,7 +36,8 @@ class Smoothing:
 
     rounds: int = 3  # of linearizing the data and estimating how fast the shape accelerates
     tails: float = 4.0  # degrees of freedom of Student's t: a few frames may be those of another motion
-    held: float = 1e-9  # deviation of what is the same in all frames, radians or metres
+    damping: float = 1e-5  # of the data's curvature, relative: single precision makes that of alike joints indefinite
+    held: float = 1e-5  # deviation of what is the same in all frames, radians or metres
 
 
 _SMOOTHING = Smoothing()
@@ -217,6 +218,7 @@ class _Smoother:
             around = objective(local[None])
             gradient[row] += around.gradient[0]
             blocks[0][row] += around.hessian[0]
+            blocks[0][row].diagonal().add_(_SMOOTHING.damping * around.hessian[0].diagonal())
         return gradient, blocks
 
 

@@ -48,6 +48,7 @@ class TrackerSettings:
     long_gap: float = 2.0  # intervals without a frame after which a limb may be anywhere
     keyframe_interval: int = 10  # frames
     num_keyframes: int = 3  # from which a lost shape is searched: a second and a half of them
+    forgotten: int = 10  # frames without a fit, half a second, after which a shape may be anywhere, or have left
 
 
 _SETTINGS = TrackerSettings()
@@ -196,6 +197,7 @@ class Tracker:
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
             else:
+                state = self._forgotten(state) if self._has_left(state) else state
                 pose = self._fitter.predict(state, elapsed)
                 view = self._fitter.look(state, frame, pose)
                 fit = self._fit(state, frame, view)
@@ -388,6 +390,10 @@ class Tracker:
         """Return whether the shape is lost that was doubtful in all frames: then it was something else."""
         return self.config.recovery == "full" and state.tracked and not state.sure and not is_supported(fit, state)
 
+    def _has_left(self, state: TrackState) -> bool:
+        """Return whether a shape was lost for so long that it is searched as one never found."""
+        return self.config.recovery == "full" and state.tracked and state.lost >= _SETTINGS.forgotten
+
     def _forgotten(self, state: TrackState) -> TrackState:
         """Return a state as before the first fit, at the same frame."""
         names = ["frame", "time", "interval", "origin", "coefficients", "coefficient_covariance", "person", "lost"]
@@ -430,6 +436,8 @@ class Tracker:
 
     def _hold(self, state: TrackState, frame: Frame, status: Status) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame without a fit, at the predicted pose, and the state after it."""
+        if status is Status.LOST and not state.found:
+            status = Status.NOT_FOUND
         pose = self._fitter.predict(state, frame.elapsed)
         after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
         after = _with_person(after, None)
