@@ -68,6 +68,7 @@ _NAMES = {
     "storage": "load",
     "tracking.config": "TrackConfig",
     "tracking.results": "DemoResult FrameResult TrackResult TrackState",
+    "tracking.smoother": "smooth_track",
     "tracking.tracker": "Tracker",
     "viz.conversions": "to_open3d to_pyvista to_trimesh",
     "viz.plots": "plot",

@@ -85,6 +85,7 @@ from torchreg.tracking.results import DemoResult as DemoResult
 from torchreg.tracking.results import FrameResult as FrameResult
 from torchreg.tracking.results import TrackResult as TrackResult
 from torchreg.tracking.results import TrackState as TrackState
+from torchreg.tracking.smoother import smooth_track as smooth_track
 from torchreg.tracking.tracker import Tracker as Tracker
 from torchreg.viz.conversions import to_open3d as to_open3d
 from torchreg.viz.conversions import to_pyvista as to_pyvista
@@ -177,6 +178,7 @@ __all__ = [
     "rig_sequence",
     "sample_skin",
     "skeletonize",
+    "smooth_track",
     "solve_pose",
     "split_support",
     "stereo_points",

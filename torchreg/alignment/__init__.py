@@ -2,14 +2,17 @@
 
 Besides the public names, other rooms may use `label_frames`, and tracking, which builds on them,
 
-- the problem: `AlignProblem`, `centered_problem`, `alignment_cost`, `GaussianPosePrior`;
+- the problem: `AlignProblem`, `centered_problem`, `alignment_cost`, `GaussianPosePrior`, `joint_precision`,
+  `model_size`; least squares: `Objective`, `surface_objective`;
 - the annealed EM: `anneal`, `outlier_level`;
 - the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
 - the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `Candidates`, `Plan`;
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
-  measured keypoints: `MeasuredKeypoints`, `keypoint_skin`; recursive shape coefficients: `PersonFilter`, `KnownPerson`;
+  measured keypoints: `MeasuredKeypoints`, `keypoint_skin`;
+- shape coefficients: `fitted_rig`, `scan_normals`, `surface_skins`, `plausible_precision`, `robust_rows`;
 - what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `near_outlier_share`, `limb_ends`,
-  `end_motions`, `end_variances`, `dof_confidence`, `SurfaceError`; in words `spread_of`;
+  `end_motions`, `end_variances`, `correlated_count`, `neighbor_correlation`,
+  `dof_confidence`, `SurfaceError`; in words `spread_of`;
 - checks of input: `check_skin`, `floating_origin`, `warn_about_units`, `warn_about_degenerate`;
 - numbers: `ANNEALING`, `CALIBRATION`, `CLUSTERS`, `INLIER_SHARE`, `INTRUSION`, `OFF_SURFACE`, `PRIOR_SHARE`,
   `SEARCH_BUDGET`, `SHAPE_CALIBRATION`, `SURFACE_FIT`, `UNITS`.

@@ -95,6 +95,10 @@ def track(
     views: DepthOptions,
     seen: Seen = None,
     known: KnownOptions,
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="At the end estimate all poses anew, each from the frames before and after it."),
+    ] = False,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -124,6 +128,9 @@ def track(
     A frame that cannot be read, or with points that are not finite under --nan-policy raise, is reported and dropped:
     its pose is predicted. After Ctrl-C the results so far are on disk, and the same command with --resume goes on to
     the same end, also with more frames than before. `torchreg export` writes poses, BVH, movies and pictures of frames.
+
+    With --smooth a second pass follows: the poses in the result are least squares of all frames. What is shown while
+    the frames come, and RESULT.progress, are of the first; --smooth with --resume smooths a run that is complete.
 
     With --stereo LEFT RIGHT --calibration FILE clouds are the corners that both cameras see. For every frame two
     pictures go to RESULT_seen: the disparity, and the left picture with its points, blue where they are inliers, and
@@ -169,7 +176,7 @@ def track(
         tracker = Tracker(model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape)
         run = TrackRun(
             tracker, clouds, fps, job, files, report=Report(bar, clouds, quiet), save_every=save_every, known=given,
-            up=direction,
+            up=direction, smooth=smooth,
         )  # fmt: skip
         run.seen = _drawn_pictures(source, folder) if cameras.stereo else None
         run.live = _live_page(pages, port, browser, quiet, direction) if view else None

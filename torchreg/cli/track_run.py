@@ -94,6 +94,11 @@ class Clouds(Sequence["Tensor"]):
 
         return as_points(self.frame(index))
 
+    @property
+    def measured(self) -> Sequence[Any]:
+        """What the tracker is given, each read when it is asked for."""
+        return _Measured(self)
+
     def frame(self, index: Any) -> Any:
         """Return what the tracker is given: a cloud, or a depth picture, see `DepthFrame`."""
         try:
@@ -122,6 +127,19 @@ class Clouds(Sequence["Tensor"]):
             if len(first):
                 return far_origin(first)
         return None
+
+
+class _Measured(Sequence["Tensor"]):
+    """Clouds or depth pictures as the tracker is given them."""
+
+    def __init__(self, clouds: Clouds) -> None:
+        self._clouds = clouds
+
+    def __len__(self) -> int:
+        return len(self._clouds)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._clouds.frame(index)
 
 
 @dataclass
@@ -181,6 +199,7 @@ class TrackRun:
     save_every: int  # frames between two writings
     known: Known
     up: Direction | None
+    smooth: bool = False  # whether all frames count for each at the end
     seen: Callable[[LinearBlendSkin], OnFrame] | None = None  # draws what the cameras saw of a frame
     live: Callable[[LinearBlendSkin], OnFrame] | None = None  # shows a frame in the browser
     parts: list[TrackResult] = field(default_factory=list)  # results of the frames done
@@ -251,12 +270,22 @@ class TrackRun:
             with OptionalOutput(self.files.progress):
                 save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
         self.clouds.on_drop = None
+        if complete and self.smooth:
+            self._smooth()
         remembering(self.located, self.up).save(self.files.result)
         if complete:
             self.report.bar.reset(len(self.clouds))
             self.report.bar.set_description("drawing")
             self.write([self.files.gltf, self.files.movie])
         return complete
+
+    def _smooth(self) -> None:
+        """Replace the poses of all frames by those of a second pass."""
+        from torchreg.tracking.smoother import smooth_track
+
+        self.report.bar.set_description("smoothing")
+        given = self.known.part(range(len(self.clouds)), self.clouds.origin)
+        self.parts = [smooth_track(self.result, self.clouds.measured, config=self.tracker.config, **given)]
 
     def _part(self, numbers: range) -> None:
         """Track some frames; fewer are done if the keyboard interrupts."""

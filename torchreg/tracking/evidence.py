@@ -41,6 +41,11 @@ def deviates_far(fit: FrameFit, state: TrackState) -> bool:
     return fit.deviation > _LIMITS.deviation * fit.view.problem.size * max(1, state.lost)
 
 
+def is_continuous(fit: FrameFit, state: TrackState) -> bool:
+    """Return whether a fit goes on from the frame before."""
+    return state.tracked and state.lost == 0 and fit.acquired != "found" and not deviates_far(fit, state)
+
+
 def residual_too_large(fit: FrameFit, state: TrackState) -> bool:
     """Return whether the data lie near the surface rather than on it, as those of another object do."""
     share = _LIMITS.doubtful_residual if state.lost else _LIMITS.max_residual

@@ -17,6 +17,7 @@ from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import stacked_rows
+from torchreg.tracking.person_filter import PersonFit
 from torchreg.tracking.results import TrackState
 
 # Fewer data, or fewer inliers, determine no pose.
@@ -87,12 +88,16 @@ class FrameView:
         origin: (3,) of its coordinates.
         rows: (4 P, 3) part transforms of the prior's mean, see `LinearBlendSkin.place`.
         in_reach: (M,) True where a point of the cloud is in reach of the shape; the problem may hold a subset of these.
+        elapsed: see `Frame`.
+        viewpoint: (3,) of the camera, if one took the frame.
     """
 
     problem: AlignProblem
     origin: Tensor
     rows: Tensor
     in_reach: Tensor
+    elapsed: float
+    viewpoint: Tensor | None
 
     def to_local(self, poses: Tensor) -> Tensor:
         """Return poses (S, num_dofs) of the world in these coordinates and within the limits, (1, S, num_dofs)."""
@@ -119,6 +124,7 @@ class FrameFit:
         limit_share: share of the joints at a limit.
         deviation: distance of most model points from the prediction, metres.
         acquired: what led to the pose, see `FrameResult`.
+        person: the fit of pose and coefficients, where these are fitted too.
     """
 
     view: FrameView
@@ -136,6 +142,7 @@ class FrameFit:
     limit_share: float
     deviation: float
     acquired: str
+    person: PersonFit | None = None
 
     @property
     def ratio_in_reach(self) -> float:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends, near_outlier_share
 from torchreg.alignment.evidence.curvature import hardly_gains
-from torchreg.alignment.evidence.reliability import Evidence, SurfaceError, weigh
+from torchreg.alignment.evidence.reliability import Evidence, weigh
 from torchreg.alignment.fit.annealed_em import anneal
 from torchreg.alignment.fit.factors import Factor
 from torchreg.alignment.fit.free_space_term import INTRUSION, FreeSpaceTerm
@@ -39,6 +39,7 @@ from torchreg.tracking.evidence import share_at_limits
 from torchreg.tracking.frame import MIN_DATA, WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.limb_combination import FAST_MOTION, fit_limbs, scatter_joints
 from torchreg.tracking.motion_model import FILTER, moves_fast, predict_pose, prediction_std, uncertainty_growth
+from torchreg.tracking.person_filter import KnownPerson, Motion, PersonFilter, PersonFit
 from torchreg.tracking.results import TrackState
 from torchreg.tracking.unexplained import UnexplainedClusters
 
@@ -64,10 +65,14 @@ class FrameFitter:
         shape: the articulated shape, in metres.
         config: see `TrackConfig`.
         skin: the model points; sampled by default.
+        person: whose coefficients are fitted too.
     """
 
-    def __init__(self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None) -> None:
-        self.shape, self.config = shape, config
+    def __init__(
+        self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None,
+        person: PersonFilter | None = None,
+    ) -> None:  # fmt: skip
+        self.shape, self.config, self.person = shape, config, person
         # About half of the shape's points are seen at a time.
         count = config.num_model_points * (2 if config.model_points == "seen" else 1)
         self.skin = skin or sample_skin(shape, count, sharpness=config.sharpness)
@@ -110,14 +115,17 @@ class FrameFitter:
             self._template, skin=skin or self.skin, data=data[None],
             valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
-            prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
+            prior=GaussianPosePrior(local[None], self.joint_precision(FILTER.max_joint_std)),
             factors=self._factors(frame, skin or self.skin, origin, num_in_reach / len(data)),
         )  # fmt: skip
         if frame.known is not None:
             informed = frame.known.near(origin).with_prior(problem, local[None])
             prior = replace(informed.prior, precision=informed.prior.precision[0])
             problem = replace(informed, lower=informed.lower[0], upper=informed.upper[0], prior=prior)
-        return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
+        viewpoint = None if frame.picture is None else frame.picture.camera.position - origin
+        return FrameView(
+            problem=problem, origin=origin, rows=rows, in_reach=in_reach, elapsed=frame.elapsed, viewpoint=viewpoint
+        )  # fmt: skip
 
     @cached_property
     def _keypoints(self) -> LinearBlendSkin:
@@ -166,12 +174,33 @@ class FrameFitter:
 
         Kernel widths before the last are ``widths``, shares of the model's size.
         """
-        problem = view.problem
-        fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=widths)
+        problem, person = view.problem, None
+        if self.person is None or acquired != "tracked":
+            fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=widths)
+            pose = fitted.pose
+        known = state.known_person
+        if self.person is not None and known is not None:
+            person = self._fitted_person(self.person, known, view, state, acquired, pose[0])
+            pose = person.pose.unsqueeze(0)
+            fitted = SurfaceResult(
+                pose, *problem.surface.distance_jacobian(problem.data, pose), person.last_step.unsqueeze(0)
+            )  # fmt: skip
         residual = surface_noise(fitted.distance, problem.valid, self.size)
-        if state.tracked:
+        if state.tracked and person is None:
             fitted = self._with_unseen_limbs_predicted(problem, fitted, residual)
-        return self._with_evidence(view, state, acquired, fitted, residual[0])
+        return replace(self._with_evidence(view, state, acquired, fitted, residual[0]), person=person)
+
+    def _fitted_person(
+        self, person: PersonFilter, known: KnownPerson, view: FrameView, state: TrackState, acquired: str, pose: Tensor
+    ) -> PersonFit:
+        """Return the fit of pose and coefficients from a pose (num_dofs,)."""
+        data, motion = view.problem.data[0], None
+        if not state.tracked and acquired == "tracked":
+            return person.joined(known, data, pose, view.viewpoint)
+        if state.lost == 0 and acquired != "found":
+            prior = self._prediction_prior(view.problem, state, view.elapsed)
+            motion = Motion(view.problem.prior.mean[0], prior.precision.rsqrt())
+        return person.fit(known, data, pose, motion, view.viewpoint)
 
     def covariance(self, fit: FrameFit) -> tuple[Tensor, Tensor]:
         """Return the covariance (num_dofs, num_dofs) of a fit and its observed share (num_dofs,).
@@ -183,10 +212,13 @@ class FrameFitter:
         if not prior.holds_base:
             precision[:6] = precision.new_tensor([self.size] * 3 + [math.pi] * 3).square().reciprocal()
         weights = _inlier_weights(fit.distance[0], fit.residual)
-        covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
+        if fit.person is None:
+            covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
+        else:
+            covariance = fit.person.known.covariance[: len(precision), : len(precision)]
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
-    def judged(self, fit: FrameFit, covariance: Tensor, error: SurfaceError | None = None) -> tuple[Evidence, bool]:
+    def judged(self, fit: FrameFit, covariance: Tensor) -> tuple[Evidence, bool]:
         """Return the evidence for a fit with a covariance (num_dofs, num_dofs), and whether it has converged.
 
         Where coefficients are fitted too, both rest on the errors of the surface, as in `align`.
@@ -199,7 +231,8 @@ class FrameFitter:
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
             intruding=fit.intruding,
         )  # fmt: skip
-        if error is not None:
+        if fit.person is not None:
+            error = fit.person.error
             return replace(evidence, unknown=error.unknown(self.size)), bool(error.converged)
         converged = float(problem.change(fit.last_step)) <= problem.pose_atol or hardly_gains(
             problem, pose, fit.distance, fit.jacobian, fit.residual[None], covariance[None]
@@ -215,7 +248,7 @@ class FrameFitter:
         unexplained = self.clusters.find(problem.data[0], distance[0], residual)
         moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
         intruding = free_space_loss(problem, pose)
-        wide_prior = GaussianPosePrior(problem.prior.mean, self._joint_precision(FILTER.max_joint_std))
+        wide_prior = GaussianPosePrior(problem.prior.mean, self.joint_precision(FILTER.max_joint_std))
         return FrameFit(
             view=view, pose=pose, distance=distance, jacobian=fitted.jacobian, transforms=transforms,
             residual=residual, last_step=fitted.last_step,
@@ -226,7 +259,7 @@ class FrameFitter:
             deviation=float(moved.quantile(_SETTINGS.deviation_quantile)), acquired=acquired,
         )  # fmt: skip
 
-    def _joint_precision(self, std: float) -> Tensor:
+    def joint_precision(self, std: float) -> Tensor:
         """Return the prior's precision (num_dofs,) for a standard deviation of the joints; zero for the base."""
         return self._template.prior.precision / std**2
 
@@ -234,7 +267,7 @@ class FrameFitter:
         """Return the prior about the prediction, the base included: few data may not turn it away."""
         prior = problem.prior
         shift, turn, joints = prediction_std(state, elapsed, self.size, self.config.prior_std).tolist()
-        precision = self._joint_precision(joints)
+        precision = self.joint_precision(joints)
         precision[:3], precision[3:6] = shift**-2, turn**-2
         if problem.prior_precision is not None:
             precision = torch.where(problem.prior_precision[0] > 0, prior.precision, precision)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.observability import dof_confidence
-from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION, SurfaceError, confidence_of
+from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION, confidence_of
 from torchreg.alignment.fit.annealed_em import outlier_level
 from torchreg.result import Status
 from torchreg.solvers.e_step import expectation
@@ -25,17 +25,16 @@ def fitted_result(
     frame: Frame,
     fit: FrameFit,
     covariance: Tensor,
-    error: SurfaceError | None = None,
 ) -> FrameResult:
-    """Return the result of a frame with a fit, its covariance (num_dofs, num_dofs), and its surface's error."""
+    """Return the result of a frame with a fit, and its covariance (num_dofs, num_dofs)."""
     problem, in_reach, origin = fit.view.problem, fit.view.in_reach, fit.view.origin
     data, distance = problem.data, fit.distance[0]
     if int(in_reach.sum()) > len(distance):
         data = (frame.cloud[in_reach] - origin)[None]
         distance = problem.surface.distance(data, fit.pose)[0]
     posed = problem.skin.place(fit.rows)
-    evidence, converged = fitter.judged(fit, covariance, error)
-    confidence = confidence_of(evidence.table(), CALIBRATION if error is None else SHAPE_CALIBRATION)[0]
+    evidence, converged = fitter.judged(fit, covariance)
+    confidence = confidence_of(evidence.table(), CALIBRATION if fit.person is None else SHAPE_CALIBRATION)[0]
     sigma = posed.new_tensor(WIDTHS.stop * problem.size)
     outlier = outlier_level(problem, posed[None], sigma[None])
     distances = _distances_out_of_reach(frame)
@@ -66,7 +65,8 @@ def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose:
         fitter, state, frame, pose=pose, registered=fitter.skin(pose), keypoints=fitter.shape.keypoints(pose),
         distances=distances, posterior=torch.zeros_like(distances), sigma=unknown, cost=unknown,
         covariance=unknown.expand(len(pose), len(pose)).clone(), status=status,
-        acquired="lost" if status is Status.LOST else "held", residual=math.nan, confidence=torch.zeros_like(unknown),
+        acquired="lost" if status in (Status.LOST, Status.NOT_FOUND) else "held",
+        residual=math.nan, confidence=torch.zeros_like(unknown),
         dof_confidence=torch.zeros_like(pose),
     )  # fmt: skip
 

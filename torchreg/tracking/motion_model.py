@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import difference
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.frame import Frame, FrameFit
 from torchreg.tracking.results import TrackState
 
@@ -34,6 +35,17 @@ class VelocityFilter:
 
 
 FILTER = VelocityFilter()
+
+
+def initial_state(skin: LinearBlendSkin, pose: Tensor, seed: int) -> TrackState:
+    """Return the state of a tracker of a skin before the first frame, at a pose (num_dofs,), NaN if it is unknown."""
+    return TrackState(
+        frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=skin.points,
+        weights=skin.weights, reference_pose=skin.reference_pose, keyframes=pose[None][:0],
+        unexplained=skin.points[:0], prediction_error=0.0, innovation=skin.points.new_zeros(3), num_data=0.0,
+        num_inliers=0.0, ratio_in_reach=0.0, residual=0.0, limit_share=0.0, lost=0, cool_down=0, failed_searches=0,
+        pending_checks=0, seed=seed, sure=False,
+    )  # fmt: skip
 
 
 def advance_clock(state: TrackState, time: float | None) -> tuple[TrackState, float]:

@@ -14,6 +14,7 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.posed_tree import named_pose
 from torchreg.shapes.record import build_kept_shape, record_kept_shape
+from torchreg.tracking.person_filter import KnownPerson
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +130,8 @@ class TrackState(Result):
         origin: (3,) float64 about which all this is, where clouds lie far from that of coordinates; None elsewhere.
         coefficients: (C,) of the person tracked, where they are fitted and a frame showed any.
         coefficient_covariance: (C, C) of them.
+        person_covariance: (D + C, D + C) of pose and coefficients, in tangent coordinates; None before the first fit
+            that was usable and after one that was not.
         person: (C,) coefficients of the rig that is followed; another one is made when its surface is off.
         sure: whether the fit to any frame was usable.
         searched: (F, 3) some data of the last frame that was searched, before the shape was first found; then None.
@@ -137,7 +140,7 @@ class TrackState(Result):
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "velocity": "D", "points": "N 3", "weights": "N P", "reference_pose": "D", "keyframes": "K D",
         "unexplained": "S 3", "innovation": "3", "coefficients": "C", "coefficient_covariance": "C C", "person": "C",
-        "searched": "F 3",
+        "person_covariance": "J J", "searched": "F 3",
     }  # fmt: skip
 
     frame: int
@@ -165,6 +168,7 @@ class TrackState(Result):
     origin: Tensor | None = None
     coefficients: Tensor | None = None
     coefficient_covariance: Tensor | None = None
+    person_covariance: Tensor | None = None
     person: Tensor | None = None
     sure: bool = True
     searched: Tensor | None = None
@@ -173,6 +177,14 @@ class TrackState(Result):
     def found(self) -> bool:
         """Whether there is a pose."""
         return bool(self.pose.isfinite().all())
+
+    @property
+    def known_person(self) -> KnownPerson | None:
+        """What is known of coefficients, and of the last pose with them after a usable frame."""
+        if self.coefficients is None or self.coefficient_covariance is None:
+            return None
+        joint = self.coefficient_covariance if self.person_covariance is None else self.person_covariance
+        return KnownPerson(self.coefficients, joint)
 
     @property
     def tracked(self) -> bool:

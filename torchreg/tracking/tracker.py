@@ -15,13 +15,11 @@ from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_ab
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.landmarks import MeasuredKeypoints
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
-from torchreg.alignment.shape.person_filter import KnownPerson, PersonFilter
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import to_local, to_world
@@ -30,12 +28,13 @@ from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.config import TrackConfig
-from torchreg.tracking.evidence import deviates_far, is_doubtful, is_supported, is_unreliable, update_means
+from torchreg.tracking.evidence import is_continuous, is_doubtful, is_supported, is_unreliable, update_means
 from torchreg.tracking.frame import MIN_DATA, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.frame_result import fitted_result, predicted_result, track_result
 from torchreg.tracking.model_points import next_model_points
-from torchreg.tracking.motion_model import advance_clock, decayed_velocity, restart_motion, update_motion
+from torchreg.tracking.motion_model import advance_clock, decayed_velocity, initial_state, restart_motion, update_motion
+from torchreg.tracking.person_filter import KnownPerson, PersonFilter
 from torchreg.tracking.recovery import Recovery, after_search
 from torchreg.tracking.results import FrameResult, TrackResult, TrackState
 
@@ -49,6 +48,7 @@ class TrackerSettings:
     long_gap: float = 2.0  # intervals without a frame after which a limb may be anywhere
     keyframe_interval: int = 10  # frames
     num_keyframes: int = 3  # from which a lost shape is searched: a second and a half of them
+    forgotten: int = 10  # frames without a fit, half a second, after which a shape may be anywhere, or have left
 
 
 _SETTINGS = TrackerSettings()
@@ -112,7 +112,7 @@ class Tracker:
             pose = self._checked_pose(initial_pose)
             # In full precision, for clouds far from the origin.
             self._start = pose if initial_pose is None else torch.as_tensor(initial_pose, dtype=torch.float64)
-            self._state = self._initial_state(pose)
+            self._state = initial_state(self._fitter.skin, pose, self.config.seed)
         self._locked = locked
         KnownDofs.of(shape, locked, None)
 
@@ -197,6 +197,7 @@ class Tracker:
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
             else:
+                state = self._forgotten(state) if self._has_left(state) else state
                 pose = self._fitter.predict(state, elapsed)
                 view = self._fitter.look(state, frame, pose)
                 fit = self._fit(state, frame, view)
@@ -208,8 +209,6 @@ class Tracker:
                     fit, state = self._recover(state, frame, view, fit)
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
-                if self._person is not None and fit is not None and result.statuses[0].usable:
-                    state = _learned(self._person, state, frame, fit)
             self._state = normal_copy(state)
             found = normal_copy(replace(
                 result, coefficients=state.coefficients, coefficient_covariance=state.coefficient_covariance
@@ -288,7 +287,7 @@ class Tracker:
             return
         self.shape, self._followed = self._person.rig.with_coefficients(coefficients), coefficients
         with torch.no_grad():
-            self._fitter = FrameFitter(self.shape, self.config, None)
+            self._fitter = FrameFitter(self.shape, self.config, None, self._person)
             self._recover = Recovery(self._fitter, StartSource.of(self.shape, upright=self.config.upright))
 
     def _follow_closer(self) -> None:
@@ -353,16 +352,6 @@ class Tracker:
         if not math.isfinite(time) or (self._state.frame > 0 and time <= latest):
             raise InputError(f"time must be finite and later than the frame before at {latest:g}, got {time}")
 
-    def _initial_state(self, pose: Tensor) -> TrackState:
-        skin = self._fitter.skin
-        return TrackState(
-            frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=skin.points,
-            weights=skin.weights, reference_pose=skin.reference_pose, keyframes=pose[None][:0],
-            unexplained=skin.points[:0], prediction_error=0.0, innovation=skin.points.new_zeros(3), num_data=0.0,
-            num_inliers=0.0, ratio_in_reach=0.0, residual=0.0, limit_share=0.0, lost=0, cool_down=0, failed_searches=0,
-            pending_checks=0, seed=self.config.seed, sure=False,
-        )  # fmt: skip
-
     def _rejection(self, data: Tensor) -> Status | None:
         """Return the status of data (M, 3) that no pose can be fitted to; None for others."""
         if len(data) < MIN_DATA:
@@ -401,27 +390,34 @@ class Tracker:
         """Return whether the shape is lost that was doubtful in all frames: then it was something else."""
         return self.config.recovery == "full" and state.tracked and not state.sure and not is_supported(fit, state)
 
+    def _has_left(self, state: TrackState) -> bool:
+        """Return whether a shape was lost for so long that it is searched as one never found."""
+        return self.config.recovery == "full" and state.tracked and state.lost >= _SETTINGS.forgotten
+
     def _forgotten(self, state: TrackState) -> TrackState:
         """Return a state as before the first fit, at the same frame."""
         names = ["frame", "time", "interval", "origin", "coefficients", "coefficient_covariance", "person", "lost"]
         kept = {name: getattr(state, name) for name in names}
-        return replace(self._initial_state(torch.full_like(state.pose, torch.nan)), **kept)
+        return replace(
+            initial_state(self._fitter.skin, torch.full_like(state.pose, torch.nan), self.config.seed), **kept
+        )
 
     def _accept(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame with the best fit that was found, and the state after it."""
         if fit is None:
             return self._hold(state, frame, Status.LOST)
         covariance, observed = self._fitter.covariance(fit)
-        error = None if self._person is None else _surface_error(self._person, state, frame, fit)
-        result = fitted_result(self._fitter, state, frame, fit, covariance, error)
-        after = self._state_after(state, frame, fit, observed)
-        return result, replace(after, sure=after.sure or result.statuses[0].usable)
+        result = fitted_result(self._fitter, state, frame, fit, covariance)
+        after, usable = self._state_after(state, frame, fit, observed), result.statuses[0].usable
+        if fit.person is not None:
+            after = _with_person(after, fit.person.known if usable else None)
+        return result, replace(after, sure=after.sure or usable)
 
     def _state_after(self, state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
         """Return the state after a fit, of whose degrees of freedom data tell the observed share (num_dofs,)."""
         found, pose = fit.acquired == "found", fit.world_pose
         after = update_means(state, fit, len(frame.data))
-        if state.tracked and state.lost == 0 and not found and not deviates_far(fit, state):
+        if is_continuous(fit, state):
             after = update_motion(after, frame, fit, observed)
         else:
             after = restart_motion(after, self._fitter.size)
@@ -440,34 +436,18 @@ class Tracker:
 
     def _hold(self, state: TrackState, frame: Frame, status: Status) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame without a fit, at the predicted pose, and the state after it."""
+        if status is Status.LOST and not state.found:
+            status = Status.NOT_FOUND
         pose = self._fitter.predict(state, frame.elapsed)
         after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
+        after = _with_person(after, None)
         return predicted_result(self._fitter, state, frame, pose, status), after
 
 
-def _surface_error(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> SurfaceError | None:
-    """Return the errors of a person's surface in a fit to a frame; None where no coefficients are known."""
-    known = _known_person(state)
+def _with_person(state: TrackState, known: KnownPerson | None) -> TrackState:
+    """Return the state with what is known of a person; without it, only the coefficients of before are."""
     if known is None:
-        return None
-    return person.surface_error(known, fit.view.problem.data[0], fit.pose[0], fit.last_step[0], _viewpoint(frame, fit))
-
-
-def _learned(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> TrackState:
-    """Return the state with what a fit to a frame tells of the coefficients."""
-    known = _known_person(state)
-    if known is None:
-        return state
-    known = person.update(known, fit.view.problem.data[0], fit.pose[0], _viewpoint(frame, fit))
-    return replace(state, coefficients=known.coefficients, coefficient_covariance=known.covariance)
-
-
-def _known_person(state: TrackState) -> KnownPerson | None:
-    if state.coefficients is None or state.coefficient_covariance is None:
-        return None
-    return KnownPerson(state.coefficients, state.coefficient_covariance)
-
-
-def _viewpoint(frame: Frame, fit: FrameFit) -> Tensor | None:
-    """Return where a picture was taken (3,), in the coordinates of a fit's view."""
-    return None if frame.picture is None else frame.picture.camera.position - fit.view.origin
+        return replace(state, person_covariance=None)
+    return replace(
+        state, coefficients=known.coefficients, coefficient_covariance=known.alone, person_covariance=known.covariance
+    )  # fmt: skip

@@ -1,0 +1,178 @@
+"""Recursive estimate of shape coefficients, frame by frame (iterated Kalman)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.reliability import SurfaceError
+from torchreg.alignment.fit.problem import joint_precision, model_size
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT
+from torchreg.alignment.shape.person_covariance import plausible_precision, robust_rows
+from torchreg.alignment.shape.shape_fit import fitted_rig, scan_normals, surface_skins
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.geometry.upright import Direction
+from torchreg.result import Status
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.shaped import ShapedTree
+from torchreg.shapes.shaped_surface import ShapedSurface
+from torchreg.solvers.arrow import shared_information
+
+
+@dataclass(frozen=True)
+class KnownPerson:
+    """A Gaussian on shape coefficients, of mean (K,), and on a pose in tangent coordinates with them.
+
+    `covariance` is that of coefficients (K, K), or of pose and coefficients (D + K, D + K).
+    """
+
+    coefficients: Tensor
+    covariance: Tensor
+
+    @property
+    def alone(self) -> Tensor:
+        """The covariance (K, K) of the coefficients."""
+        count = len(self.coefficients)
+        return self.covariance[-count:, -count:]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where a person is expected: a pose (D,) and its standard deviations (D,) after what the frame before told."""
+
+    pose: Tensor
+    std: Tensor
+
+
+@dataclass(frozen=True)
+class PersonFit:
+    """A pose (D,) fitted together with coefficients, the errors of the surface, and all that is known then."""
+
+    pose: Tensor
+    last_step: Tensor
+    known: KnownPerson
+    error: SurfaceError
+
+
+@dataclass(frozen=True)
+class PersonUpdate:
+    """Numbers of an update."""
+
+    steps: int = 4  # of Gauss-Newton, from a pose and coefficients that are nearly right
+
+
+_UPDATE = PersonUpdate()
+
+
+class PersonFilter:
+    """Estimates the shape coefficients of a rig recursively, frame by frame; ``fit_shape`` as of `align`."""
+
+    def __init__(
+        self, shape: ArticulatedShape, fit_shape: bool | str, seed: int = 0, upright: Direction | None = None
+    ) -> None:
+        self.rig = fitted_rig(shape, fit_shape)
+        self.space = self.rig.coefficient_space()
+        self._config = AlignConfig(nan_policy="omit", upright=upright, seed=seed)
+        tree, generator = ShapedTree(self.rig, self.space), torch.Generator().manual_seed(seed)
+        self._model, self._skin = surface_skins(
+            tree, self.rig.file_surface(), self._config.num_model_points, generator
+        )  # fmt: skip
+        self._size = model_size(self._model)
+        joints = joint_precision(self.rig, self._size, self._config.prior_std)
+        self._precision = plausible_precision(self.rig, self._size, joints).double()
+
+    def initialize(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
+        """Return the pose (num_dofs,) and coefficients of a first frame; None where the shape is not found."""
+        found = align(self.rig, data, start, fit_shape=True, clothed=False, config=self._config)
+        mean, covariance = found.coefficients, found.coefficient_covariance
+        shows = found.statuses[0] in (Status.CONVERGED, Status.MAX_STEPS, Status.DOUBTFUL)
+        if not shows or mean is None or covariance is None:
+            return None
+        return found.pose, KnownPerson(mean, covariance)
+
+    def fit(
+        self, person: KnownPerson, data: Tensor, start: Tensor, motion: Motion | None, viewpoint: Tensor | None = None
+    ) -> PersonFit:
+        """Return pose and coefficients after another frame (M, 3), from a start (D,) near its pose.
+
+        The iterated Kalman filter as Gauss-Newton (Bell and Cathey 1993): ``|d(x, c)|^2_W + |(x, c) - (m, c_0)|^2_P``
+        is least, with P the information of all frames before, whose poses are marginalized. Joints follow
+        ``x = r + a (m - r) + w``, ``a^2 = 1 - q^2 / s^2``, with q the deviation of the motion and s that of poses about
+        rest r: what no data show returns to rest, and is never known better or worse than it is told. Without a motion
+        poses are independent of those before.
+        """
+        surface, valid = self._surface(data, viewpoint), torch.ones_like(data[:, 0], dtype=torch.bool)
+        center, prior = self._prior(person, start, motion)
+        tree, dofs, state = self._skin.shape, self.rig.num_dofs, torch.cat([start, center[0, len(start) :]])[None]
+        for _ in range(_UPDATE.steps):
+            hessian, gradient = self._normal_equations(surface, data, valid, state)
+            gradient = gradient + prior @ tree.difference(center, state)[0].double()
+            step = -torch.linalg.solve(hessian + prior, gradient).to(state)
+            moved = tree.retract(state, step[None])
+            inside = torch.minimum(torch.maximum(moved, tree.lower), tree.upper)
+            state = torch.cat([moved[:, :6], inside[:, 6:]], dim=-1)
+        hessian, _ = self._normal_equations(surface, data, valid, state)
+        covariance = torch.linalg.inv(hessian + prior)
+        error = self._error(state, step, covariance)
+        known = KnownPerson(state[0, dofs:], covariance.to(person.covariance))
+        return PersonFit(state[0, :dofs], step[:dofs], known, error)
+
+    def joined(self, person: KnownPerson, data: Tensor, pose: Tensor, viewpoint: Tensor | None = None) -> PersonFit:
+        """Return a person found by `initialize`, together with a pose (D,), in a frame that counts once."""
+        surface, valid = self._surface(data, viewpoint), torch.ones_like(data[:, 0], dtype=torch.bool)
+        state = torch.cat([pose, person.coefficients.to(pose)])[None]
+        hessian, _ = self._normal_equations(surface, data, valid, state)
+        known = torch.linalg.inv(person.covariance.double())
+        hessian = hessian + torch.cat([self._precision, known.diagonal()]).diag()
+        error = self._error(state, torch.zeros_like(state[0]), torch.linalg.inv(hessian))
+        count = len(person.coefficients)
+        told = shared_information(hessian, self.rig.num_dofs)
+        hessian[-count:, -count:] += known - told
+        joint = KnownPerson(person.coefficients, torch.linalg.inv(hessian).to(person.covariance))
+        return PersonFit(pose, torch.zeros_like(pose), joint, error)
+
+    def _error(self, state: Tensor, last_step: Tensor, covariance: Tensor) -> SurfaceError:
+        """Return the errors of the surface in a state (1, D + K) with a covariance, after a step (D + K,)."""
+        _, moves = self._model.row_jacobian(state)
+        moved = (moves @ last_step).square().sum(-1).mean(-1).sqrt()
+        return SurfaceError.of(self._model, moves, covariance[None].to(state), moved)
+
+    def _prior(self, person: KnownPerson, start: Tensor, motion: Motion | None) -> tuple[Tensor, Tensor]:
+        """Return the mean (1, D + K) of pose and coefficients before a frame, and its information (D + K, D + K)."""
+        dofs, count = self.rig.num_dofs, len(person.coefficients)
+        if motion is None or len(person.covariance) == count:
+            information = torch.linalg.inv(person.alone.double())
+            center = torch.cat([start, person.coefficients.to(start)])[None]
+            return center, torch.block_diag(self._precision.diag(), information)
+        moved, kept = pad(motion.std.double().square(), (0, count)), torch.ones(dofs + count, dtype=torch.float64)
+        kept[6:dofs] = (1 - moved[6:dofs] * self._precision[6:]).clamp_min(0).sqrt()
+        moved[6:dofs] = (1 - kept[6:dofs].square()) / self._precision[6:]
+        rest = self.rig.rest[6:]
+        joints = rest + kept[6:dofs].to(rest) * (motion.pose[6:] - rest)
+        center = torch.cat([motion.pose[:6], joints, person.coefficients.to(start)])[None]
+        covariance = kept.unsqueeze(-1) * person.covariance.double() * kept + moved.diag()
+        return center, torch.linalg.inv(covariance)
+
+    def _surface(self, data: Tensor, viewpoint: Tensor | None) -> ShapedSurface:
+        normals = scan_normals(data, torch.ones_like(data[:, 0], dtype=torch.bool), viewpoint)
+        return ShapedSurface(self._skin, normals[None], SURFACE_FIT.max_width * self._size)
+
+    def differs(self, first: Tensor, second: Tensor) -> bool:
+        """Return whether two people with coefficients (K,) differ, at rest, by more than a model is exact."""
+        vertices = self.space.rest(torch.stack([first, second]).to(self.space.mean))[0]
+        moved = (vertices[0] - vertices[1]).square().sum(-1).mean().sqrt()
+        return float(moved) > SURFACE_FIT.min_noise(self._size)
+
+    def _normal_equations(
+        self, surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the Gauss-Newton Hessian (D + K, D + K) and the gradient (D + K,) of the data alone, float64."""
+        rows = robust_rows(surface, data[None], valid[None], state, self._size)
+        factor = (rows.weights.sqrt() / rows.noise.unsqueeze(-1))[0].double()
+        jacobian = rows.jacobian[0].double() * factor.unsqueeze(-1)
+        return jacobian.mT @ jacobian, jacobian.mT @ (rows.distance[0].double() * factor)
