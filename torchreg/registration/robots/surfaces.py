@@ -36,7 +36,7 @@ class Target:
     def __init__(self, points: Tensor, normals: Tensor) -> None:
         self.points, self.normals = points, normals
         self.spacing = sampling_distance(points)
-        self._tree = NeighborTree(points)
+        self.tree = NeighborTree(points)
 
     def residuals(self, moved: Tensor, normals: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return signed distances (..., K) of moved points from this scan's planes, its normals, and squared distances.
@@ -45,7 +45,7 @@ class Target:
         those of points whose normals (..., K, 3) face the other way, or that no point of the scan is within reach of,
         are infinite.
         """
-        found, distance = self._tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
+        found, distance = self.tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
         index = found.reshape(moved.shape[:-1])
         near = distance.reshape(moved.shape[:-1]).isfinite()
         offset, facing = moved - self.points[index], self.normals[index]
