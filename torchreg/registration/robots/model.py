@@ -191,15 +191,18 @@ def assembled(
     lengths = torch.tensor([joint.length for joint in joints.values()], dtype=torch.float64)
     chosen = pairs[minimum_spanning_forest(pairs, lengths - lengths.min() + 1, count).chosen()] if len(pairs) else pairs
     parents, order = rooted(chosen, surfaces.travel(motions, label).argmin().reshape(1), count)
-    place = torch.empty_like(order)
-    place[order] = torch.arange(count)
+    place = torch.zeros_like(order)
     above, axes, values = [-1], [torch.zeros(6).double()], [torch.zeros(frames).double()]
     for link in order[1:].tolist():
         parent = int(parents[link])
         joint = joints[min(link, parent), max(link, parent)]
-        above.append(int(place[parent]))
-        axes.append(joint.twist)
-        values.append(joint.values if parent < link else -joint.values)
+        # Seen from the other link, joints in a row come in reverse. Between two of them is a link without samples.
+        row = list(zip(joint.twists, joint.values.mT, strict=True))
+        for number, (twist, value) in enumerate(row if parent < link else row[::-1]):
+            above.append(len(above) - 1 if number else int(place[parent]))
+            axes.append(twist)
+            values.append(value if parent < link else -value)
+        place[link] = len(above) - 1
     mechanism = Mechanism(
         parents=tuple(above), axes=torch.stack(axes), base=motions[:, order[0]], values=torch.stack(values, 1)
     )
@@ -212,8 +215,12 @@ def _loose(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise
     motions = surfaces.refined(mechanism.motions(), label, [scale] * 3)
     blocks = surfaces.blocks(motions, label, scale)
     pairs = [(parent, link) for link, parent in enumerate(mechanism.parents)]
+    shown = torch.bincount(label, minlength=len(pairs)) > 0
     return tuple(
-        pair[0] >= 0 and best_joint(relative(motions, blocks, pair, noise, surfaces.size)).length > 0 for pair in pairs
+        pair[0] >= 0
+        and shown[list(pair)].all()
+        and best_joint(relative(motions, blocks, pair, noise, surfaces.size)).length > 0
+        for pair in pairs
     )
 
 
