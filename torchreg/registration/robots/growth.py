@@ -16,7 +16,7 @@ from torchreg.geometry.rigid import invert_rigid, rigid_matrix, se3_log, transfo
 from torchreg.geometry.rotation import so3_exp, spread_rotations
 from torchreg.geometry.sampling import even_order
 from torchreg.registration.blend import turn_about
-from torchreg.registration.robots.surfaces import Target
+from torchreg.registration.robots.surfaces import Surfaces, Target
 from torchreg.solvers.robust import geman_mcclure_weight
 
 
@@ -27,12 +27,12 @@ class GrowthNumbers:
     samples: int = 2000  # of the reference
     neighbors: int = 8  # of a sample, along which a link spreads
     reach: float = 2.5  # of a cloud's spacing: 99 of 100 points of a surface sampled anew are as near to the other sample
-    rotations: int = 3000  # of a piece about its border, 17 degrees apart
-    compared: int = 80  # points of a piece that are compared in a search, and so many of a cloud
+    rotations: int = 1500  # of a piece about its border, 20 degrees apart
+    compared: int = 60  # points of a piece that are compared in a search, and so many of a cloud
     pieces: tuple[int, ...] = (40, 100, 250)  # samples of the pieces that are searched for
-    kept: int = 16  # best rotations of a frame, which are refined
+    kept: int = 12  # best rotations of a frame, which are refined
     distinct: int = 4  # of these that differ, whose axes are tried
-    turns: int = 48  # values of a hinge that are tried
+    turns: int = 36  # values of a hinge that are tried
     steps: int = 10  # of a refinement
     least: int = 12  # samples of a link
     apart: float = 0.35  # radians between poses that differ
@@ -153,6 +153,10 @@ class Growth:
     debug: bool = False
 
     @property
+    def size(self) -> float:
+        return float((self.samples.amax(0) - self.samples.amin(0)).norm())
+
+    @property
     def limit(self) -> float:
         return GROWTH.reach * self.spacing
 
@@ -162,9 +166,18 @@ class Growth:
         found = []
         for target, frame in zip(self.targets, motions, strict=True):
             moved = transform_points(frame, samples)
-            distance = target.tree.nearest_within(moved.reshape(-1, 3), self.limit)[1].reshape(moved.shape[:-1])
-            found.append((distance / self.limit).clamp_max(1).square())
+            index, distance = (row.reshape(moved.shape[:-1]) for row in target.tree.nearest_within(moved.reshape(-1, 3), self.limit))
+            offset = moved - target.points[index]
+            across = (offset * target.normals[index]).sum(-1).square()
+            along = (offset.square().sum(-1) - across).clamp_min(0).sqrt()
+            square = (across + (along - 2 * self.spacing).clamp_min(0).square()) / self.spacing**2
+            found.append(torch.where(distance.isfinite(), square, 1.0).clamp_max(1))
         return torch.stack(found).mean(0).mT
+
+    def settled(self, motions: Tensor, own: Tensor, scales: Sequence[float]) -> Tensor:
+        """Return motions (F, 1, 4, 4) fitted to some samples (k,)."""
+        surfaces = Surfaces(self.samples[own], self.normals[own], self.edges, own, tuple(self.targets), self.size)
+        return surfaces.refined(motions, torch.zeros_like(own), [scale * self.spacing for scale in scales])
 
     def relabeled(self) -> None:
         """Label the samples by the links found so far."""
@@ -184,6 +197,8 @@ class Growth:
         return [(target.points[free], target.normals[free]) for target, free in zip(self.targets, kept, strict=True)]
 
 
+ROOT = (8.0, 6.0, 4.0, 3.0, 2.0, 1.0, 1.0)
+FINE = (2.0, 1.0, 1.0)
 EXPLAINED = 0.45  # of the cost of an outlier: the middle between those of right points, .15, and of wrong ones, .8
 
 
@@ -197,9 +212,9 @@ def grown(points: Tensor, normals: Tensor, targets: Sequence[Target], start: Ten
     edges = torch.cat([edges, links])
     spacing = sum(target.spacing for target in targets) / len(targets)
     growth = Growth(samples, normals[order], edges, targets, spacing, start[:, :0], torch.full((len(samples),), -1), debug)
-    costs = growth.costs(start)
-    root = int((costs < EXPLAINED).sum(0).argmax())
-    growth.motions = start[:, root : root + 1]
+    roots = torch.cat([growth.settled(start[:, k : k + 1], torch.arange(len(samples)), ROOT) for k in range(start.shape[1])], 1)
+    root = int((growth.costs(roots) < EXPLAINED).sum(0).argmax())
+    growth.motions = roots[:, root : root + 1]
     growth.relabeled()
     failed: set[tuple[int, tuple[int, ...]]] = set()
     while True:
@@ -219,6 +234,10 @@ def grown(points: Tensor, normals: Tensor, targets: Sequence[Target], start: Ten
             growth.motions = torch.cat([growth.motions, motion.unsqueeze(1)], 1)
             before = growth.label
             growth.relabeled()
+            own = (growth.label == growth.motions.shape[1] - 1).nonzero()[:, 0]
+            if len(own) >= GROWTH.least:
+                growth.motions[:, -1:] = growth.settled(motion.unsqueeze(1), own, FINE)
+                growth.relabeled()
             new = int((growth.label == growth.motions.shape[1] - 1).sum())
             if new < GROWTH.least:
                 growth.motions, growth.label = growth.motions[:, :-1], before
@@ -282,7 +301,7 @@ def searched(growth: Growth, front: Front, free: list[tuple[Tensor, Tensor]]) ->
                 print(f"     size {size} r {radius:.3f} gain {gain:.1f} explained {int((costs < EXPLAINED).sum())}")
             if gain > best[0]:
                 best = gain, motion
-        if size >= len(own):
+        if size >= len(own) or best[0] > 0.8 * len(own):
             break
     return best
 
