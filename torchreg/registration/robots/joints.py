@@ -1,4 +1,4 @@
-"""Joints between links: a weld, a hinge, a slider, two hinges in a row or none, by the criterion of Schwarz on what the data hold."""
+"""Joints between links: a weld, a hinge, a slider, two hinges in a row or none, by the criterion of Schwarz."""
 
 from __future__ import annotations
 
@@ -186,10 +186,8 @@ def _slides(data: Relative, twists: Tensor) -> Tensor:
     return torch.nn.functional.pad(_together(data.information[:, :3, :3], twists[:, :3]), (0, 3)).unsqueeze(1)
 
 
-def _fitted(
-    data: Relative, axes: Tensor, values_of: Callable[[Tensor], Tensor]
-) -> tuple[float, Tensor, Tensor]:
-    """Return the least cost over starts (S, J, 6) of J joints in a row, the axes (J, 6) there, and the values (T, J)."""
+def _fitted(data: Relative, axes: Tensor, values_of: Callable[[Tensor], Tensor]) -> tuple[float, Tensor, Tensor]:
+    """Return the least cost over starts (S, J, 6) of J joints in a row, their axes (J, 6) and values (T, J)."""
     frames, (starts, count) = len(data.motions), axes.shape[:2]
     own = torch.arange(frames)
     state = torch.cat([axes.flatten(1), values_of(axes).flatten(1)], -1)

@@ -115,6 +115,11 @@ class Surfaces:
         size = float((samples.amax(0) - samples.amin(0)).norm())
         return cls(samples, normals, edges, patch, tuple(targets), size)
 
+    @property
+    def spacing(self) -> float:
+        """Mean distance between points of a scan."""
+        return sum(target.spacing for target in self.targets) / len(self.targets)
+
     def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return samples and normals (..., n, 3) under motions (..., n, 4, 4)."""
         turn = transforms[..., :3, :3]
@@ -134,10 +139,9 @@ class Surfaces:
         moved = [self.moved(frame[label]) for frame in motions]
         found = [t.residuals(*m, self.size) for t, m in zip(self.targets, moved, strict=True)]
         across, square = torch.stack([f[0] for f in found]), torch.stack([f[2] for f in found])
-        spacing = sum(target.spacing for target in self.targets) / len(self.targets)
         near = square.isfinite()
         typical = float(square[near].sqrt().median()) if bool(near.any()) else 0.0
-        sigma = max(NUMBERS.to_deviation * typical, NUMBERS.roughness * spacing)
+        sigma = max(NUMBERS.to_deviation * typical, NUMBERS.roughness * self.spacing)
         inlier = square < (NUMBERS.cut * sigma) ** 2
         return Noise(sigma, self._repeats(torch.where(inlier, across, 0.0), inlier, label))
 
