@@ -11,6 +11,7 @@ reference, moved by the file's own joints, lie from where they truly are, as med
     python benchmarks/scan_urdf.py --fused
     python benchmarks/scan_urdf.py --fused --robot ROBOT.urdf     # a robot of a file, in random steps
     python benchmarks/scan_urdf.py --around                       # 5,000 points all around, no normals, any order
+    python benchmarks/scan_urdf.py --around --robot A.urdf B.urdf # robots of files, in random poses within limits
     python benchmarks/scan_urdf.py --data FOLDER                  # a hexapod's ten clouds, against its official URDF
 """
 
@@ -118,18 +119,44 @@ class Arm:
 def around(arm: Arm, generator: torch.Generator) -> tuple[Arm, list[tr.RangeScan]]:
     """Return an arm in random poses, and clouds of its whole surface, new points in each, without normals."""
     values = RANGE * (2 * torch.rand(len(arm.poses), arm.poses.shape[1] - 6, generator=generator).double() - 1)
+    if isinstance(arm.tree, tr.ArticulatedShape):
+        lower, upper = arm.tree.lower[6:], arm.tree.upper[6:]
+        middle = arm.tree.rest[6:].maximum(lower + RANGE).minimum((upper - RANGE).maximum((lower + upper) / 2))
+        values = (middle + values).maximum(lower).minimum(upper)
     arm = replace(arm, poses=torch.nn.functional.pad(values, (6, 0)))
-    return arm, [tr.RangeScan(scattered(tr.TriangleMesh(frame, arm.faces), generator)) for frame in arm.placed()]
+    clouds = []
+    for frame in arm.placed():
+        points = scattered(tr.TriangleMesh(frame, arm.faces), 12 * POINTS, generator)
+        clouds.append(tr.RangeScan(points[outside(points)][:POINTS]))
+    return arm, clouds
 
 
-def scattered(mesh: tr.TriangleMesh, generator: torch.Generator) -> Tensor:
-    """Return points (N, 3) evenly at random on a mesh."""
+def outside(points: Tensor, views: int = 60, pixel: float = 0.006) -> Tensor:
+    """Return which dense points (N, 3) some parallel view from around shows, in pixels of a share of the size."""
+    index = torch.arange(views, dtype=torch.float64) + 0.5
+    height, turn = 1 - 2 * index / views, index * math.pi * (1 + 5**0.5)
+    ring = (1 - height.square()).sqrt()
+    size = pixel * float((points.amax(0) - points.amin(0)).norm())
+    shown = torch.zeros(len(points), dtype=torch.bool)
+    for view in torch.stack([ring * turn.cos(), ring * turn.sin(), height], -1):
+        cells = (points @ torch.linalg.svd(view.unsqueeze(0)).Vh[1:].mT / size).floor()
+        cell = cells.unique(dim=0, return_inverse=True)[1]
+        depth = points @ view
+        nearest = torch.full((int(cell.max()) + 1,), -torch.inf, dtype=torch.float64).scatter_reduce(
+            0, cell, depth, "amax"
+        )
+        shown |= depth > nearest[cell] - size
+    return shown
+
+
+def scattered(mesh: tr.TriangleMesh, count: int, generator: torch.Generator) -> Tensor:
+    """Return points (count, 3) evenly at random on a mesh."""
     corners = mesh.vertices[mesh.faces]
     a, b, c = corners.unbind(1)
     area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
-    chosen = corners[torch.multinomial(area, POINTS, True, generator=generator)]
+    chosen = corners[torch.multinomial(area, count, True, generator=generator)]
     # Exponential variables over their sum are even on a triangle.
-    shares = -torch.rand(POINTS, 3, generator=generator, dtype=torch.float64).log()
+    shares = -torch.rand(count, 3, generator=generator, dtype=torch.float64).log()
     return (shares.unsqueeze(-1) * chosen).sum(1) / shares.sum(-1, keepdim=True)
 
 
@@ -148,6 +175,7 @@ def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int]:
         f"{name}: {int(right.sum())} of {len(right)} joints right, {len(robot.tree) - 1} found, axes off "
         f"{', '.join(f'{a:.1f}' for a in angles.tolist())} degrees, "
         f"{', '.join(f'{100 * a / size:.1f}' for a in across.tolist())} % of the size; "
+        f"stds found {', '.join(f'{a:.1f}' for a in torch.rad2deg(robot.axis_std).tolist())} degrees; "
         f"{found.status}, {spent:.0f} CPU s",
         flush=True,
     )
@@ -311,7 +339,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=10, help="per arm")
     parser.add_argument("--joints", type=int, nargs="+", default=[3, 5, 7], help="of the arms")
     parser.add_argument("--fused", action="store_true", help="clouds of four depth cameras instead of whole surfaces")
-    parser.add_argument("--robot", type=Path, help="URDF file of a robot to scan instead of made-up arms")
+    parser.add_argument("--robot", type=Path, nargs="+", help="URDF files of robots to scan instead of made-up arms")
     parser.add_argument(
         "--around", action="store_true", help="clouds of the whole surface, without normals, in any order"
     )
@@ -326,15 +354,19 @@ def main(arguments: list[str] | None = None) -> int:
     if options.around:
         counts = []
         for seed in options.seeds:
-            for joints in options.joints:
+            for path in options.robot or ():
+                arm = Arm.of_file(path, options.frames, seed)
+                counts.append(show_around(arm, f"{path.stem}, seed {seed}", seed))
+            for joints in () if options.robot else options.joints:
                 arm = Arm.drawn(joints, options.frames, seed=seed + joints)
                 counts.append(show_around(arm, f"{joints} joints, seed {seed}", seed))
         print("{} of {} joints right".format(*map(sum, zip(*counts, strict=True))))
         return 0
     if options.robot:
-        for seed in options.seeds:
-            arm = Arm.of_file(options.robot, options.frames, seed)
-            show(arm, f"{options.robot.stem}, seed {seed}, {options.frames} frames", options.fused)
+        for path in options.robot:
+            for seed in options.seeds:
+                arm = Arm.of_file(path, options.frames, seed)
+                show(arm, f"{path.stem}, seed {seed}, {options.frames} frames", options.fused)
         return 0
     for joints in options.joints:
         show(Arm.drawn(joints, options.frames, seed=joints), f"{joints} joints, {options.frames} frames", options.fused)

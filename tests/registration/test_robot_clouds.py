@@ -62,3 +62,42 @@ def test_frames_are_reached_from_those_most_like_them_whatever_their_order():
     assert sorted(tree.order) == list(range(5))
     assert all(tree.order.index(p) < tree.order.index(f) for f, p in enumerate(tree.parents) if p >= 0)
     assert FrameTree.in_turn(2, 5) == FrameTree((1, 2, -1, 2, 3), (2, 3, 4, 1, 0))
+
+
+def test_links_that_moved_too_far_to_be_registered_are_found_from_the_base_outward():
+    draw = torch.Generator().manual_seed(3)
+    # Boxes with a knob on one side, whose half turns differ.
+    box = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((0.1, 0.08, 0.28)),
+            trimesh.creation.box((0.05, 0.05, 0.08)).apply_translation((0.02, 0.06, 0.05)),
+        ]
+    )
+    axes = [torch.nn.functional.normalize(torch.randn(3, generator=draw).double(), dim=0) for _ in range(2)]
+    twists = [torch.cat([torch.linalg.cross((k + 1) * END, axis), axis]) for k, axis in enumerate(axes)]
+    values = 2.4 * torch.rand(5, 2, generator=draw).double() - 1.2
+    clouds = []
+    for row in values:
+        frame, placed = torch.eye(4, dtype=torch.float64), []
+        for number in range(3):
+            if number:
+                frame = frame @ se3_exp(row[number - 1] * twists[number - 1])
+            seed = int(torch.randint(10**6, (1,), generator=draw))
+            points = (
+                torch.from_numpy(trimesh.sample.sample_surface(box, 700, seed=seed)[0].copy()) + (number + 0.5) * END
+            )
+            placed.append(points @ frame[:3, :3].mT + frame[:3, 3])
+        clouds.append(torch.cat(placed))
+    scans = [tr.RangeScan(cloud) for cloud in clouds]
+    targets = [Target(scan.points, scan.normals) for scan in scans]
+    # Registration is of no help: nothing moved, all points are one part.
+    still, part = clouds[0].expand(5, -1, 3), torch.zeros(len(clouds[0]), dtype=torch.long)
+    found = find_robot(scans[0].points, scans[0].normals, still, part, targets, sparse=True)
+    assert [joint.kind for joint in found.tree.joints[1:]] == ["revolute", "revolute"]
+    # The first cloud's pose is the zero pose: the second axis is where the first joint had moved it.
+    first = se3_exp(values[0, 0] * twists[0])
+    true = [(axes[0], END), (first[:3, :3] @ axes[1], first[:3, :3] @ (2 * END) + first[:3, 3])]
+    for joint, origin, (axis, place) in zip(found.tree.joints[1:], found.origins()[1:], true, strict=True):
+        assert abs(float(torch.tensor(joint.axis, dtype=torch.float64) @ axis)) > math.cos(math.radians(1))
+        assert torch.linalg.cross(origin - place, axis).norm() < 0.003
+    torch.testing.assert_close(found.joint_values.abs(), (values - values[0]).abs(), atol=0.02, rtol=0)

@@ -13,6 +13,9 @@ from torchreg.registration.robots.surfaces import Blocks, Noise
 SIGMA, SAMPLES, FRAMES = 1e-3, 200, 9
 AXIS = torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
 POINT = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
+# Of a second hinge, beyond a link that nothing shows.
+SECOND_AXIS = torch.nn.functional.normalize(torch.tensor([0.8, -0.6, 0.4], dtype=torch.float64), dim=0)
+SECOND = torch.cat([torch.linalg.cross(POINT + torch.tensor([0.02, 0.03, 0.0]).double(), SECOND_AXIS), SECOND_AXIS])
 
 
 def found(kind, seed, directions=6):
@@ -21,11 +24,14 @@ def found(kind, seed, directions=6):
     ``directions`` of the second link's coordinates have normals: round things determine fewer.
     """
     draw = {"generator": seeded(seed), "dtype": D}
-    values = 0.4 * torch.randn(FRAMES, **draw)
+    values, others = 0.4 * torch.randn(2, FRAMES, **draw)
     none = torch.zeros(3, dtype=D)
     twist = {"fixed": (none, none), "revolute": (torch.linalg.cross(POINT, AXIS), AXIS), "prismatic": (AXIS, none)}
     moved, joint = se3_exp(0.3 * torch.randn(2, FRAMES, 6, **draw))
-    joint = joint if kind == "free" else se3_exp(values.unsqueeze(-1) * torch.cat(twist[kind]))
+    if kind == "universal":
+        joint = se3_exp(values.unsqueeze(-1) * torch.cat(twist["revolute"])) @ se3_exp(others.unsqueeze(-1) * SECOND)
+    elif kind != "free":
+        joint = se3_exp(values.unsqueeze(-1) * torch.cat(twist[kind]))
     motions, rows, centers = torch.stack([moved, moved @ joint], 1), [], []
     for link, held in enumerate((6, directions)):
         points = transform_points(motions[:, link], 0.2 * torch.randn(SAMPLES, 3, **draw) + link * 0.3)
@@ -46,17 +52,22 @@ def found(kind, seed, directions=6):
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic", "free"])
+@pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic", "universal", "free"])
 def test_the_kind_of_a_joint_is_found_with_its_axis_and_values(kind, seed):
     joint, values = found(kind, seed)
     assert (joint.length > 0) == (kind == "free")
     assert kind in ("free", joint.kind)
     if kind in ("revolute", "prismatic"):
-        cosine = float((joint.twist[3:] if kind == "revolute" else joint.twist[:3]) @ AXIS)
+        cosine = float((joint.twists[0, 3:] if kind == "revolute" else joint.twists[0, :3]) @ AXIS)
         assert abs(cosine) > math.cos(math.radians(0.5))
-        torch.testing.assert_close(math.copysign(1, cosine) * joint.values, values, atol=3e-3, rtol=0)
+        torch.testing.assert_close(math.copysign(1, cosine) * joint.values[:, 0], values, atol=3e-3, rtol=0)
+    if kind == "universal":
+        for twist, true in zip(joint.twists, (torch.cat([torch.linalg.cross(POINT, AXIS), AXIS]), SECOND), strict=True):
+            assert abs(float(twist[3:] @ true[3:])) > math.cos(math.radians(1))
+            point, place = (torch.linalg.cross(values[3:], values[:3]) for values in (twist, true))
+            assert float(torch.linalg.cross(point - place, true[3:]).norm()) < 3e-3
     if kind == "revolute":
-        point = torch.linalg.cross(joint.twist[3:], joint.twist[:3])
+        point = torch.linalg.cross(joint.twists[0, 3:], joint.twists[0, :3])
         assert float(torch.linalg.cross(point - POINT, AXIS).norm()) < 1e-3
 
 

@@ -11,6 +11,8 @@ from torch import Tensor
 SMALL_SQUARED_ANGLE = 1e-4
 # 1 + cosine below which two directions are opposite.
 _OPPOSITE = 1e-6
+# Square root of two, and the positive root of x^4 = x + 4.
+_SPIRAL_STEPS = (math.sqrt(2), 1.533751168755204288118041)
 
 
 def skew(vector: Tensor) -> Tensor:
@@ -73,6 +75,20 @@ def rotation_between(start: Tensor, end: Tensor) -> Tensor:
     axis = torch.linalg.cross(start, smallest, dim=-1)
     axis = axis / axis.norm(dim=-1, keepdim=True)
     return torch.where(opposite, 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - identity, rotation)
+
+
+def spread_rotations(count: int) -> Tensor:
+    """Return ``count`` rotation matrices (count, 3, 3), float64, spread evenly: super-Fibonacci spirals, Alexa 2022."""
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    inner, outer = (index / count).sqrt(), (1 - index / count).sqrt()
+    first, second = (2 * math.pi * index / step for step in _SPIRAL_STEPS)
+    x, y, z, w = inner * first.sin(), inner * first.cos(), outer * second.sin(), outer * second.cos()
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def _exp_quaternion(rotation_vector: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.base.frames import BaseFrame, carrier
-from torchreg.alignment.search.rough_poses import spread_rotations
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, transform_points
+from torchreg.geometry.rotation import spread_rotations
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin

@@ -17,9 +17,9 @@ from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_p
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.search.multi_start import Candidates
-from torchreg.alignment.search.rough_poses import bent_pose, spread_rotations, typical_poses
+from torchreg.alignment.search.rough_poses import bent_pose, typical_poses
 from torchreg.errors import InputError
-from torchreg.geometry.rotation import so3_log
+from torchreg.geometry.rotation import so3_log, spread_rotations
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted

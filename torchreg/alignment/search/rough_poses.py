@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from torchreg._checks import check_count, check_direction
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
-from torchreg.geometry.rotation import rotation_between, so3_exp, so3_log
+from torchreg.geometry.rotation import rotation_between, so3_exp, so3_log, spread_rotations
 from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulation import Articulation
@@ -36,8 +36,6 @@ class _RigidEM:
 _RIGID_EM = _RigidEM()
 # Typical poses lie at these shares of the way from the rest pose to the middle of the joint limits.
 _BENT_SHARES = (0.2, 0.8)
-# Square root of two, and the positive root of x^4 = x + 4.
-_SPIRAL_STEPS = (math.sqrt(2), 1.533751168755204288118041)
 
 
 class PoseSource(Protocol):
@@ -117,20 +115,6 @@ def bent_pose(shape: Articulation, share: float) -> Tensor:
     """Return the pose (num_dofs,) at a share of the way from the rest pose to the middle of the joint limits."""
     middle = 0.5 * (shape.lower + shape.upper)
     return shape.rest + share * torch.where(middle.isfinite(), middle - shape.rest, 0.0)
-
-
-def spread_rotations(count: int) -> Tensor:
-    """Return ``count`` rotation matrices (count, 3, 3), float64, spread evenly: super-Fibonacci spirals, Alexa 2022."""
-    index = torch.arange(count, dtype=torch.float64) + 0.5
-    inner, outer = (index / count).sqrt(), (1 - index / count).sqrt()
-    first, second = (2 * math.pi * index / step for step in _SPIRAL_STEPS)
-    x, y, z, w = inner * first.sin(), inner * first.cos(), outer * second.sin(), outer * second.cos()
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def _principal_axes(points: Tensor, weights: Tensor) -> Tensor:

@@ -17,12 +17,11 @@ from torchreg.alignment.search.rough_poses import (
     UprightRotations,
     closeness,
     register_rigidly,
-    spread_rotations,
     two_sided_cost,
     typical_poses,
 )
 from torchreg.alignment.shape.shape_problem import ShapeProblem
-from torchreg.geometry.rotation import compose_rotation_vectors, so3_log
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_log, spread_rotations
 from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulation import Articulation

@@ -94,8 +94,8 @@ class _System:
     local: Tensor
     local_gradient: Tensor
     mixed: Tensor
-    outer: Tensor
-    outer_gradient: Tensor
+    outer: Tensor  # (T, 6 K, 6 K)
+    outer_gradient: Tensor  # (T, 6 K)
     hold: Tensor
 
     @classmethod
@@ -117,15 +117,34 @@ class _System:
             local=local + 1e-9 * torch.diag_embed(local.diagonal(dim1=-2, dim2=-1) + weight.mean()),
             local_gradient=(own.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1),
             mixed=(own.mT @ hessian @ shared).sum(1),
-            outer=(shared.mT @ hessian @ shared).sum((0, 1)),
-            outer_gradient=(shared.mT @ blocks.gradient.unsqueeze(-1)).sum((0, 1)).squeeze(-1),
+            outer=(shared.mT @ hessian @ shared).sum(1),
+            outer_gradient=(shared.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1),
             hold=FIT.damping * weight.mean() * metric.repeat(size) + 1e-9,
         )
 
-    def eliminated(self) -> tuple[Tensor, Tensor]:
-        """Return the frames' solutions (T, D, 6 K + 1) and the system (6 K, 6 K) of the axes (Schur complement)."""
+    def eliminated(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the frames' solutions (T, D, 6 K + 1), and their shares of the system of the axes (Schur complement).
+
+        These are matrices (T, 6 K, 6 K) and gradients (T, 6 K).
+        """
         solved = torch.linalg.solve(self.local, torch.cat([self.mixed, self.local_gradient.unsqueeze(-1)], -1))
-        return solved, self.outer - (self.mixed.mT @ solved[..., :-1]).sum(0) + torch.diag(self.hold)
+        gradient = self.outer_gradient - (self.mixed.mT @ solved[..., -1:]).squeeze(-1)
+        return solved, self.outer - self.mixed.mT @ solved[..., :-1], gradient
+
+    def axes_covariance(self, variance: float) -> Tensor:
+        """Return the covariance (6 K, 6 K) of the axes: of errors of a variance, and of what differs between frames.
+
+        What the points of a frame share, the noise of their residuals does not show; it shows in how far the axes move
+        when a frame is left out, here by one step each (the cluster jackknife of survey statistics).
+        """
+        _, matrices, gradients = self.eliminated()
+        everything, count = matrices.sum(0) + torch.diag(self.hold), len(matrices)
+        covariance = variance * torch.linalg.pinv(everything, hermitian=True)
+        if count < 3:
+            return covariance
+        moved = torch.linalg.solve(everything - matrices, gradients.unsqueeze(-1)).squeeze(-1)
+        moved = moved - moved.mean(0)
+        return covariance + (count - 1) / count * moved.mT @ moved
 
 
 def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
@@ -134,8 +153,8 @@ def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float
     if not axes:
         step = -torch.linalg.solve(system.local, system.local_gradient)
         return mechanism.stepped(step[:, :6], step[:, 6:], torch.zeros(size, 6).double())
-    solved, reduced = system.eliminated()
-    step = -torch.linalg.solve(reduced, system.outer_gradient - (system.mixed.mT @ solved[..., -1:]).sum(0).squeeze(-1))
+    solved, reduced, gradient = system.eliminated()
+    step = -torch.linalg.solve(reduced.sum(0) + torch.diag(system.hold), gradient.sum(0))
     own_step = -(solved[..., -1] + solved[..., :-1] @ step)
     return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step.reshape(size, 6))
 
@@ -144,9 +163,8 @@ def axis_stds(
     surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
-    _, reduced = _System.of(surfaces, mechanism, label, FIT.scales[-1] * noise.sigma).eliminated()
-    size = len(points)
-    everything = noise.sigma**2 * noise.repeats * torch.linalg.pinv(reduced, hermitian=True)
+    system, size = _System.of(surfaces, mechanism, label, FIT.scales[-1] * noise.sigma), len(points)
+    everything = system.axes_covariance(noise.sigma**2 * noise.repeats)
     own = everything.reshape(size, 6, size, 6)[range(size), :, range(size)]
     turns = mechanism.axes[:, 3:].any(-1)
     directions = torch.where(turns.unsqueeze(-1), mechanism.axes[:, 3:], mechanism.axes[:, :3])

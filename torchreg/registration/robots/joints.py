@@ -1,8 +1,9 @@
-"""Joints between links: a weld, a hinge, a slider or none, by the criterion of Schwarz on what the data hold."""
+"""Joints between links: a weld, a hinge, a slider, two hinges in a row or none, by the criterion of Schwarz."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +21,9 @@ class JointNumbers:
 
     steps: int = 15  # of a fit from each start
     loose: float = 1.0  # standard deviation where data hold nothing: a radian, or half the size of the thing
+    directions: int = 400  # of the second of two hinges in a row, 7 degrees apart
+    starts: int = 6  # best of these that are refined
+    universal: int = 4  # frames from which two hinges in a row are fewer parameters than free motions
     ridge: float = 1e-6  # of the curvature, for directions that move no joint, as a shift along its axis
 
 
@@ -30,9 +34,9 @@ JOINTS = JointNumbers()
 class Candidate:
     """The best joint between two links, in the coordinates of the reference."""
 
-    kind: str  # "fixed", "revolute" or "prismatic"
-    twist: Tensor  # (6,) of a unit turn or slide; zero for a weld
-    values: Tensor  # (T,) of the joint
+    kind: str  # "fixed", "revolute", "prismatic" or "universal", two hinges in a row
+    twists: Tensor  # (J, 6) of unit turns or slides, in a row; zero for a weld
+    values: Tensor  # (T, J) of the joints
     length: float  # its description length minus that of a free motion: below zero, the data speak for the joint
 
 
@@ -74,42 +78,101 @@ def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Nois
 
 
 def best_joint(data: Relative) -> Candidate:
-    """Return the joint of least description length: squared errors in standard deviations, and parameters."""
+    """Return the joint of least description length: squared errors in standard deviations, and parameters.
+
+    Two hinges in a row, between which a link moves that no scan shows to turn, are tried where no single joint holds.
+    """
     frames, rate = len(data.motions), math.log(data.count)
     twists = se3_log(data.motions)
     weld = float((twists.unsqueeze(-2) @ data.information @ twists.unsqueeze(-1)).sum())
-    still = torch.zeros(frames, dtype=torch.float64)
+    still = torch.zeros(frames, 1, dtype=torch.float64)
     found = {
-        "fixed": (weld, torch.zeros(6, dtype=torch.float64), still),
-        "revolute": _fitted(data, _screws(data, twists)),
-        "prismatic": _fitted(data, _slides(data, twists)),
+        "fixed": (weld, torch.zeros(1, 6, dtype=torch.float64), still),
+        "revolute": _fitted(data, _screws(data, twists), _angles_about(twists)),
+        "prismatic": _fitted(data, _slides(data, twists), lambda axes: twists[None, :, :3] @ axes[..., :3].mT),
     }
-    parameters = {"fixed": 0, "revolute": frames + 4, "prismatic": frames + 2}
-    lengths = {kind: fit[0] + (parameters[kind] - 6 * frames) * rate for kind, fit in found.items()}
-    kind = min(lengths, key=lambda name: lengths[name])
-    _, twist, values = found[kind]
+    parameters = {"fixed": 0, "revolute": frames + 4, "prismatic": frames + 2, "universal": 2 * frames + 8}
+
+    def length(kind: str) -> float:
+        return found[kind][0] + (parameters[kind] - 6 * frames) * rate
+
+    if min(map(length, found)) > 0 and frames >= JOINTS.universal:
+        found["universal"] = _fitted(data, _crosses(data), _two_angles(data))
+    kind = min(found, key=length)
+    _, axes, values = found[kind]
     if kind == "prismatic":
-        return Candidate(kind, twist, data.unit * values, lengths[kind])
+        return Candidate(kind, axes, data.unit * values, length(kind))
     # From half sizes about a center back to lengths about the origin.
-    shift = data.unit * twist[:3] + torch.linalg.cross(data.center, twist[3:])
-    return Candidate(kind, torch.cat([shift, twist[3:]]), values, lengths[kind])
+    shift = data.unit * axes[:, :3] + torch.linalg.cross(data.center.expand(len(axes), 3), axes[:, 3:])
+    return Candidate(kind, torch.cat([shift, axes[:, 3:]], -1), values, length(kind))
+
+
+def _angles_about(twists: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return what gives the angles (S, T, 1) of motions of twists (T, 6) about axes (S, 1, 6)."""
+    return lambda axes: twists[None, :, 3:] @ axes[..., 3:].mT
 
 
 def _screws(data: Relative, twists: Tensor) -> Tensor:
-    """Return axes (S, 6) of turns to start from: those of every frame's motion, and of all together."""
+    """Return axes (S, 1, 6) of turns to start from: those of every frame's motion, and of all together."""
     turns = twists[:, 3:]
     directions = torch.cat([turns, _together(data.information[:, 3:, 3:], turns)])
     directions = directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    rows = []
-    for direction in directions:
-        # The point that all frames' turns about this direction leave in place.
-        angles = turns @ direction
-        turn = so3_exp(angles.unsqueeze(-1) * direction) - torch.eye(3).double()
-        normal = (turn.mT @ turn).sum(0) + 1e-6 * torch.eye(3).double()
-        right = -(turn.mT @ data.motions[:, :3, 3:]).sum(0).squeeze(-1)
-        point = torch.linalg.solve(normal, right)
-        rows.append(torch.cat([torch.linalg.cross(point, direction), direction]))
-    return torch.stack(rows)
+    turned = so3_exp((turns @ directions.mT).mT.unsqueeze(-1) * directions.unsqueeze(1))
+    return _through(data, directions.unsqueeze(1), turned.unsqueeze(2))
+
+
+def _crosses(data: Relative) -> Tensor:
+    """Return pairs of axes (S, 2, 6) of turns in a row to start from.
+
+    Of motions R = exp(x a) exp(y b) the angle between a and R b is that between a and b: for each b of many, a is the
+    direction along which R b changes least.
+    """
+    index = torch.arange(JOINTS.directions, dtype=torch.float64) + 0.5
+    height, turn = 1 - index / JOINTS.directions, index * (math.pi * (1 + 5**0.5))
+    ring = (1 - height.square()).sqrt()
+    second = torch.stack([ring * turn.cos(), ring * turn.sin(), height], -1)
+    change = (data.motions[:, :3, :3] - torch.eye(3).double()) @ second.mT  # (T, 3, S)
+    values, vectors = torch.linalg.eigh(torch.einsum("tis,tjs->sij", change, change))
+    best = values[:, 0].argsort()[: JOINTS.starts]
+    pairs = torch.stack([vectors[best, :, 0], second[best]], 1)
+    angles = _two_angles(data)(torch.nn.functional.pad(pairs, (3, 0)))
+    return _through(data, pairs, so3_exp(angles.unsqueeze(-1) * pairs.unsqueeze(1)))
+
+
+def _two_angles(data: Relative) -> Callable[[Tensor], Tensor]:
+    """Return what gives the angles (S, T, 2) of the motions about pairs of axes (S, 2, 6) in a row."""
+
+    def angles(axes: Tensor) -> Tensor:
+        first, second = axes[:, None, :1, 3:], axes[:, None, 1:, 3:]
+        turn = data.motions[:, :3, :3]
+        return torch.cat([_angle(first, second, second @ turn.mT), -_angle(second, first, first @ turn)], -1)
+
+    return angles
+
+
+def _angle(axis: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """Return the angle (..., 1) about an axis (..., 1, 3) from one direction to another."""
+    sine = (torch.linalg.cross(start.expand_as(end), end) * axis).sum(-1)
+    cosine = (start * end).sum(-1) - (start * axis).sum(-1) * (end * axis).sum(-1)
+    return torch.atan2(sine, cosine)
+
+
+def _through(data: Relative, directions: Tensor, turned: Tensor) -> Tensor:
+    """Return axes (S, J, 6) of directions (S, J, 3) through points that turns (S, T, J, 3, 3) in a row leave in place.
+
+    The translation of turns R1 R2 about points p and q is (1 - R1) p + R1 (1 - R2) q.
+    """
+    starts, frames, count = turned.shape[:3]
+    before = torch.eye(3).double().expand(starts, frames, 3, 3)
+    columns = []
+    for joint in range(count):
+        after = before @ turned[:, :, joint]
+        columns.append(before - after)
+        before = after
+    matrix = torch.cat(columns, -1)
+    normal = (matrix.mT @ matrix).sum(1) + 1e-6 * torch.eye(3 * count).double()
+    points = torch.linalg.solve(normal, (matrix.mT @ data.motions[:, :3, 3:]).sum(1)).reshape(starts, count, 3)
+    return torch.cat([torch.linalg.cross(points, directions), directions], -1)
 
 
 def _together(information: Tensor, vectors: Tensor) -> Tensor:
@@ -119,42 +182,45 @@ def _together(information: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _slides(data: Relative, twists: Tensor) -> Tensor:
-    """Return axes (3, 6) of slides to start from."""
-    return torch.nn.functional.pad(_together(data.information[:, :3, :3], twists[:, :3]), (0, 3))
+    """Return axes (3, 1, 6) of slides to start from."""
+    return torch.nn.functional.pad(_together(data.information[:, :3, :3], twists[:, :3]), (0, 3)).unsqueeze(1)
 
 
-def _fitted(data: Relative, axes: Tensor) -> tuple[float, Tensor, Tensor]:
-    """Return the least cost over starts (S, 6), the axis (6,) there, and the values (T,)."""
-    frames, starts = len(data.motions), len(axes)
-    sliding = bool((axes[:, 3:] == 0).all())
-    twists = se3_log(data.motions)
-    along = slice(0, 3) if sliding else slice(3, 6)
-    values = (twists[None, :, along] * axes[:, None, along]).sum(-1)
-    state = torch.cat([axes, values], -1)
+def _fitted(data: Relative, axes: Tensor, values_of: Callable[[Tensor], Tensor]) -> tuple[float, Tensor, Tensor]:
+    """Return the least cost over starts (S, J, 6) of J joints in a row, their axes (J, 6) and values (T, J)."""
+    frames, (starts, count) = len(data.motions), axes.shape[:2]
+    own = torch.arange(frames)
+    state = torch.cat([axes.flatten(1), values_of(axes).flatten(1)], -1)
 
-    def parts(state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        axis, values = state[:, None, :6], state[:, 6:]
-        moved = se3_exp(values.unsqueeze(-1) * axis)
-        return axis, moved, se3_log(data.motions @ invert_rigid(moved))
+    def parts(state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        axes = state[:, None, : 6 * count].unflatten(-1, (count, 6))
+        turns = se3_exp(state[:, 6 * count :].unflatten(-1, (frames, count)).unsqueeze(-1) * axes)
+        before = [torch.eye(4).double().expand(starts, frames, 4, 4)]
+        for joint in range(count):
+            before.append(before[-1] @ turns[:, :, joint])
+        seen = adjoint(torch.stack(before[:-1], 2))
+        return axes, turns, seen, se3_log(data.motions @ invert_rigid(before[-1]))
 
     def linearize(state: Tensor) -> Linearization:
-        axis, moved, error = parts(state)
-        by_axis = adjoint(moved) - torch.eye(6).double()
-        by_value = torch.zeros(starts, frames, 6, frames, dtype=torch.float64)
-        by_value[:, range(frames), :, range(frames)] = -axis.expand(starts, frames, 6).transpose(0, 1)
-        jacobian = torch.cat([by_axis, by_value], -1)
+        axes, turns, seen, error = parts(state)
+        by_axis = -seen @ (torch.eye(6).double() - adjoint(turns))  # (S, T, J, 6, 6)
+        by_value = torch.zeros(starts, frames, 6, frames, count, dtype=torch.float64)
+        by_value[:, own, :, own] = -(seen @ axes.unsqueeze(-1)).squeeze(-1).mT.transpose(0, 1)
+        jacobian = torch.cat([by_axis.transpose(2, 3).flatten(-2), by_value.flatten(-2)], -1)
         weighed = data.information @ jacobian
         hessian = (jacobian.mT @ weighed).sum(1)
         ridge = JOINTS.ridge * hessian.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-12
-        hessian = hessian + ridge[:, None, None] * torch.eye(6 + frames).double()
+        hessian = hessian + ridge[:, None, None] * torch.eye(hessian.shape[-1]).double()
         gradient = (weighed.mT @ error.unsqueeze(-1)).sum(1).squeeze(-1)
         cost = 0.5 * (error.unsqueeze(-2) @ data.information @ error.unsqueeze(-1)).sum((1, 2, 3))
         return Linearization(cost, gradient, hessian)
 
     def retract(state: Tensor, step: Tensor) -> Tensor:
-        axis = (adjoint(se3_exp(step[:, :6])) @ state[:, :6].unsqueeze(-1)).squeeze(-1)
-        return torch.cat([axis, state[:, 6:] + step[:, 6:]], -1)
+        old, change = (values[:, : 6 * count].unflatten(-1, (count, 6)) for values in (state, step))
+        axes = (adjoint(se3_exp(change)) @ old.unsqueeze(-1)).squeeze(-1)
+        return torch.cat([axes.flatten(1), state[:, 6 * count :] + step[:, 6 * count :]], -1)
 
     found = levenberg_marquardt(linearize, state, retract=retract, max_steps=JOINTS.steps)
     best = int(found.cost.argmin())
-    return 2 * float(found.cost[best]), found.state[best, :6], found.state[best, 6:]
+    axes, values = found.state[best].split((6 * count, frames * count))
+    return 2 * float(found.cost[best]), axes.reshape(count, 6), values.reshape(frames, count)

@@ -22,6 +22,7 @@ from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
 from torchreg.registration.robots.fit import HasBlocks, Mechanism, axis_stds, fitted, settled
 from torchreg.registration.robots.fusion import FusedScans
+from torchreg.registration.robots.growth import grown
 from torchreg.registration.robots.joints import Candidate, best_joint, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
@@ -100,9 +101,11 @@ def find_robot(
 
     Parts, and pieces of them, propose motions; samples take those of least description length. Two links that touch
     hold together, turn, slide or move freely, by the criterion of Schwarz on what the data hold of their relative
-    motions; those that hold together are one. The joints of most evidence make a tree, whose axes and values are fitted
-    to all scans together; links and joints are then looked for once more from there. Last, ``sparse`` scans, points
-    whose normals are estimates, are compared with each other on each link.
+    motions; those that hold together are one. Between two may be a link that no scan shows to turn, with a hinge at
+    either end. The joints of most evidence make a tree, whose axes and values are fitted
+    to all scans together; links and joints are then looked for once more from there. In ``sparse`` scans, points whose
+    normals are estimates, links are also looked for one after another, which needs no registration; last, these scans
+    are compared with each other on each link.
 
     ``part``: (N,) labels of bones, at least as many as links that registration tells apart (Isack and Boykov 2012 for
     the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most evidence).
@@ -118,6 +121,8 @@ def find_robot(
     order = even_order(points, min(len(points), MODEL.samples))
     surfaces = Surfaces.of(points[order], normals[order], [scans[frame] for frame in frames.tolist()])
     motions, label = without_gaps(moved[frames], part[order])
+    if sparse:
+        motions, label = with_grown_links(surfaces, motions, label)
     for _ in range(MODEL.rounds):
         motions, label, noise = find_links(surfaces, motions, label)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
@@ -138,6 +143,15 @@ def find_robot(
     found = _described(mechanism, points, link, frames, residuals, loose)
     axis, origin = axis_stds(fit[0], mechanism, label, fit[1], found.origins())
     return replace(found, axis_std=axis[1:], origin_std=origin[1:])
+
+
+def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the motions (T, K, 4, 4) and those of links that are found one after another; the better labels (n,)."""
+    found, new = grown(surfaces, motions)
+    new = new + motions.shape[1]
+    motions = torch.cat([motions, found], 1)
+    costs = [float(surfaces.cost(motions, labels, surfaces.spacing).sum()) for labels in (label, new)]
+    return motions, label if costs[0] < costs[1] else new
 
 
 def compared_with_each_other(
@@ -191,15 +205,18 @@ def assembled(
     lengths = torch.tensor([joint.length for joint in joints.values()], dtype=torch.float64)
     chosen = pairs[minimum_spanning_forest(pairs, lengths - lengths.min() + 1, count).chosen()] if len(pairs) else pairs
     parents, order = rooted(chosen, surfaces.travel(motions, label).argmin().reshape(1), count)
-    place = torch.empty_like(order)
-    place[order] = torch.arange(count)
+    place = torch.zeros_like(order)
     above, axes, values = [-1], [torch.zeros(6).double()], [torch.zeros(frames).double()]
     for link in order[1:].tolist():
         parent = int(parents[link])
         joint = joints[min(link, parent), max(link, parent)]
-        above.append(int(place[parent]))
-        axes.append(joint.twist)
-        values.append(joint.values if parent < link else -joint.values)
+        # Seen from the other link, joints in a row come in reverse. Between two of them is a link without samples.
+        row = list(zip(joint.twists, joint.values.mT, strict=True))
+        for number, (twist, value) in enumerate(row if parent < link else row[::-1]):
+            above.append(len(above) - 1 if number else int(place[parent]))
+            axes.append(twist)
+            values.append(value if parent < link else -value)
+        place[link] = len(above) - 1
     mechanism = Mechanism(
         parents=tuple(above), axes=torch.stack(axes), base=motions[:, order[0]], values=torch.stack(values, 1)
     )
@@ -212,8 +229,12 @@ def _loose(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise
     motions = surfaces.refined(mechanism.motions(), label, [scale] * 3)
     blocks = surfaces.blocks(motions, label, scale)
     pairs = [(parent, link) for link, parent in enumerate(mechanism.parents)]
+    shown = torch.bincount(label, minlength=len(pairs)) > 0
     return tuple(
-        pair[0] >= 0 and best_joint(relative(motions, blocks, pair, noise, surfaces.size)).length > 0 for pair in pairs
+        pair[0] >= 0
+        and bool(shown[list(pair)].all())
+        and best_joint(relative(motions, blocks, pair, noise, surfaces.size)).length > 0
+        for pair in pairs
     )
 
 
@@ -227,9 +248,9 @@ def _described(
     values[frames], base[frames] = mechanism.values, mechanism.base
     joints: list[Joint] = []
     origins: list[Tensor] = []
+    middles = _middles(points, link, len(mechanism.parents))
     for number, (parent, twist) in enumerate(zip(mechanism.parents, mechanism.axes, strict=True)):
-        own = points[link == number]
-        origin = _origin(twist, own.mean(0) if len(own) else points.mean(0))
+        origin = _origin(twist, middles[number])
         above = origins[parent] if parent >= 0 else torch.zeros_like(origin)
         origins.append(origin)
         offset = rigid_matrix(torch.eye(3, dtype=torch.float64), origin - above)
@@ -246,6 +267,15 @@ def _described(
         origin_std=torch.zeros(len(joints) - 1, dtype=torch.float64),
         loose=tuple(names),
     )
+
+
+def _middles(points: Tensor, link: Tensor, count: int) -> list[Tensor]:
+    """Return the middles (3,) of the links' points (N, 3); a link that shows none has that of the next."""
+    found = [points.mean(0)]
+    for number in reversed(range(count)):
+        own = points[link == number]
+        found.append(own.mean(0) if len(own) else found[-1])
+    return found[:0:-1]
 
 
 def _origin(twist: Tensor, middle: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ class Target:
     def __init__(self, points: Tensor, normals: Tensor) -> None:
         self.points, self.normals = points, normals
         self.spacing = sampling_distance(points)
-        self._tree = NeighborTree(points)
+        self.tree = NeighborTree(points)
 
     def residuals(self, moved: Tensor, normals: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return signed distances (..., K) of moved points from this scan's planes, its normals, and squared distances.
@@ -45,7 +45,7 @@ class Target:
         those of points whose normals (..., K, 3) face the other way, or that no point of the scan is within reach of,
         are infinite.
         """
-        found, distance = self._tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
+        found, distance = self.tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
         index = found.reshape(moved.shape[:-1])
         near = distance.reshape(moved.shape[:-1]).isfinite()
         offset, facing = moved - self.points[index], self.normals[index]
@@ -115,6 +115,11 @@ class Surfaces:
         size = float((samples.amax(0) - samples.amin(0)).norm())
         return cls(samples, normals, edges, patch, tuple(targets), size)
 
+    @property
+    def spacing(self) -> float:
+        """Mean distance between points of a scan."""
+        return sum(target.spacing for target in self.targets) / len(self.targets)
+
     def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return samples and normals (..., n, 3) under motions (..., n, 4, 4)."""
         turn = transforms[..., :3, :3]
@@ -134,10 +139,9 @@ class Surfaces:
         moved = [self.moved(frame[label]) for frame in motions]
         found = [t.residuals(*m, self.size) for t, m in zip(self.targets, moved, strict=True)]
         across, square = torch.stack([f[0] for f in found]), torch.stack([f[2] for f in found])
-        spacing = sum(target.spacing for target in self.targets) / len(self.targets)
         near = square.isfinite()
         typical = float(square[near].sqrt().median()) if bool(near.any()) else 0.0
-        sigma = max(NUMBERS.to_deviation * typical, NUMBERS.roughness * spacing)
+        sigma = max(NUMBERS.to_deviation * typical, NUMBERS.roughness * self.spacing)
         inlier = square < (NUMBERS.cut * sigma) ** 2
         return Noise(sigma, self._repeats(torch.where(inlier, across, 0.0), inlier, label))
 
