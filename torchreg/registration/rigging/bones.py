@@ -105,10 +105,10 @@ class BoneTree:
             parents=tuple(place[self.parents[bone]] for bone in order),
         )
 
-    def pruned(self, alike: float) -> BoneTree:
+    def pruned(self, alike: float, most: int) -> BoneTree:
         """Return the tree without bones that never move their vertices farther than that from where parents would.
 
-        The mean over the vertices counts.
+        The mean over the vertices counts. Of more bones than ``most`` those that move least are left out, too.
         """
         bones = self
         while len(bones) > 1:
@@ -118,7 +118,7 @@ class BoneTree:
                 own = bones.vertices[owner == bone]
                 one, other = (transform_points(bones.motions[:, each], own) for each in (bone, parent))
                 apart[bone - 1] = (one - other).norm(dim=-1).mean(-1).amax() if len(own) else 0.0
-            if float(apart.min()) > alike:
+            if float(apart.min()) > alike and len(bones) <= most:
                 break
             bones = bones.without(int(apart.argmin()) + 1)
         return bones

@@ -99,7 +99,7 @@ def _rigged(
         on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
     )  # fmt: skip
     scan = frames.scans[frames.template]
-    bones = BoneTree.of_sequence(found, frames.mesh, scan).pruned(config.alike * float(scan.diagonal))
+    bones = BoneTree.of_sequence(found, frames.mesh, scan).pruned(config.alike * float(scan.diagonal), count)
     fitter = SurfaceFitter(bones.shape(frames.mesh.faces, up), scan, config)
     starts = dict(zip(rows, poses_of_motions(fitter.shape, bones.motions), strict=True))
     return fitter.shape, *_fitted_poses(fitter, starts, frames, step)
