@@ -1,11 +1,12 @@
-"""Rigs of sequences: python benchmarks/rig_sequence.py --data FOLDER [--rigs 12] [--captured samba thomas].
+"""Rigs of sequences: python benchmarks/rig_sequence.py --data FOLDER [--rigs 12] [--frames 20] [--captured samba].
 
-FOLDER/library holds rigged .glb files with clips: each gives frames at equal times, every frame meshed anew by
-another tessellation, with noise of .1 % of the diagonal. FOLDER also holds captured sequences as .npz of vertices and
-faces. Prints mean two-way distances of the posed surface, % of the template's diagonal, of all frames but the template
-and of the worst one; the same of the template held still, and of its parts registered rigidly one by one from frame to
-frame; bones beside those that move in the clip; moving joints with a found one within 5 % of the diagonal; CPU s a
-frame. Without --data nothing is measured.
+FOLDER/library holds rigged .glb files: those with a clip in which joints move are taken, spread over their names. Each
+gives frames at equal times, every frame meshed anew by another tessellation, with noise of .1 % of the diagonal. FOLDER
+also holds captured sequences as .npz of vertices and faces. Prints mean two-way distances of the posed surface, % of
+the template's diagonal, of all frames but the template and of the worst one; the same of the template held still, and
+of its parts registered rigidly one by one from frame to frame; bones beside those that move in the clip; moving joints
+with a found one within 5 % of the diagonal; CPU s a frame; last the sums over all rigs. --alone leaves out the parts,
+which cost as much as the rigs. Without --data nothing is measured.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,24 +34,31 @@ from torchreg.registration.rigging.distances import surface_distances
 NOISE, POINTS, SAMPLES, MOVING, NEAR = 0.001, 8000, 20_000, 0.15, 0.05
 
 
-@dataclass
-class Truth:
-    """Joints (J, 3) of the bones that move, in each frame: (T, J, 3)."""
+@dataclass(frozen=True)
+class Figures:
+    """What is measured of a sequence: a line of text, and for sums the errors, joints near and all, bones of both."""
 
-    joints: Tensor
+    text: str
+    mean: float
+    worst: float
+    near: int = 0
+    joints: int = 0
+    bones: int = 0
 
 
-def clip(file: Path, count: int) -> tuple[list[tr.TriangleMesh], Truth]:
-    """Return frames of a rig's clip at equal steps between its keyframes, and its moving joints in each."""
+def clip(file: Path, count: int) -> tuple[list[tr.TriangleMesh], Tensor]:
+    """Return frames of a rig's clip at equal steps between its keyframes, and its moving joints (T, J, 3) in each."""
     keys: list[tr.TriangleMesh] = []
     try:
         while len(keys) < 10 * count:
             keys.append(tr.load_mesh(file, frame=len(keys)))
     except tr.errors.TorchregError:
         pass
+    if len(keys) < 3:
+        return [], torch.zeros(0, 0, 3)
     chosen = np.unique(np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int))
     meshes = [keys[index] for index in chosen]
-    return meshes, Truth(moving_joints(tr.ArticulatedShape.from_gltf(file), meshes))
+    return meshes, moving_joints(tr.ArticulatedShape.from_gltf(file), meshes)
 
 
 def moving_joints(shape: tr.ArticulatedShape, meshes: Sequence[tr.TriangleMesh]) -> Tensor:
@@ -138,7 +146,7 @@ def part_by_part(rig: tr.SequenceRig, meshes: Sequence[tr.TriangleMesh]) -> Tens
     return placed
 
 
-def measure(name: str, meshes: Sequence[tr.TriangleMesh], truth: Truth | None) -> str:
+def measure(name: str, meshes: Sequence[tr.TriangleMesh], joints: Tensor | None, *, alone: bool) -> Figures:
     begin = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", tr.errors.TorchregWarning)
@@ -146,21 +154,45 @@ def measure(name: str, meshes: Sequence[tr.TriangleMesh], truth: Truth | None) -
     seconds = (time.process_time() - begin) / len(meshes)
     faces, still = rig.shape.file_skin().faces, rig.shape.file_skin().points
     size = float((still.amax(0) - still.amin(0)).norm())
-    posed, parts = rig.vertices(), part_by_part(rig, meshes)
+    posed = rig.vertices()
     others = [frame for frame in range(len(meshes)) if frame != rig.template and bool(posed[frame].isfinite().all())]
-    errors = [
-        torch.tensor([distance(tr.TriangleMesh(way[frame], faces), meshes[frame]) for frame in others]) / size
-        for way in (posed, still.expand_as(posed), parts)
-    ]
-    text = "  ".join(
-        f"{word} {float(row.mean()):6.2%}, worst {float(row.max()):6.2%}"
-        for word, row in zip(("rig", "still", "parts"), errors, strict=True)
-    )
-    if truth is not None and truth.joints.shape[1]:
-        joints = truth.joints[rig.template]
-        near = torch.cdist(joints, rig.joints.double()).amin(1) / size < NEAR
-        text += f"  bones {len(rig.joints)} of {len(joints) + 1}, joints {float(near.double().mean()):.0%}"
-    return f"{name:24} {text}  {rig.status}  {seconds:.1f} CPU s"
+    rivals = {"rig": posed, "still": still.expand_as(posed)} | ({} if alone else {"parts": part_by_part(rig, meshes)})
+    text, rows = f"{name:24}", []
+    for word, placed in rivals.items():
+        row = torch.tensor([distance(tr.TriangleMesh(placed[frame], faces), meshes[frame]) for frame in others]) / size
+        text += f" {word} {float(row.mean()):6.2%}, worst {float(row.max()):6.2%} "
+        rows.append(row)
+    near = count = 0
+    if joints is not None:
+        count = joints.shape[1]
+        found = rig.joints[1:].double()
+        near = int((torch.cdist(joints[rig.template], found) / size < NEAR).any(1).sum()) if len(found) else 0
+        text += f" bones {len(rig.joints)} of {count + 1}, joints {near} of {count}"
+    text += f"  {rig.status}  {seconds:.1f} CPU s"
+    return Figures(text, float(rows[0].mean()), float(rows[0].max()), near, count, len(rig.joints))
+
+
+def rigs(
+    folder: Path, names: Sequence[str], count: int, frames: int
+) -> Iterator[tuple[str, list[tr.TriangleMesh], Tensor]]:
+    """Yield names, frames meshed anew and moving joints of rigs whose clips move any, spread over all names."""
+    files = sorted(folder.glob("*.glb"))
+    files = [file for file in files if file.stem in names] if names else files
+    # Multiples of the golden ratio, modulo one, spread any number of files evenly.
+    order = np.argsort(np.arange(len(files)) * 0.6180339887498949 % 1)
+    for index in order:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", tr.errors.TorchregWarning)
+            try:
+                meshes, joints = clip(files[index], frames)
+            except tr.errors.TorchregError as error:
+                print(f"{files[index].stem:24} not read: {error}")
+                continue
+        if joints.shape[1] and count > 0:
+            count -= 1
+            yield files[index].stem, [anew(mesh, seed) for seed, mesh in enumerate(meshes)], joints
+        if count == 0:
+            return
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -170,6 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--names", nargs="*", default=[], help="these of the library alone")
     parser.add_argument("--frames", type=int, default=20, help="of each sequence, at most")
     parser.add_argument("--captured", nargs="*", default=["samba", "horse_gallop", "thomas"], help="names without .npz")
+    parser.add_argument("--alone", action="store_true", help="without the parts registered one by one")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     if options.data is None:
@@ -178,20 +211,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.captured:
         file = next(iter(sorted(options.data.rglob(f"{name}.npz"))), None)
         if file is not None:
-            print(measure(name, captured(file, options.frames), None), flush=True)
-    files = sorted((options.data / "library").glob("*.glb"))
-    files = [file for file in files if file.stem in options.names] if options.names else files
-    for file in files[:: max(1, len(files) // max(1, options.rigs))][: options.rigs]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", tr.errors.TorchregWarning)
-            try:
-                meshes, truth = clip(file, options.frames)
-            except tr.errors.TorchregError as error:
-                print(f"{file.stem:24} not read: {error}")
-                continue
-        if len(meshes) < 3:
-            continue
-        print(measure(file.stem, [anew(mesh, seed) for seed, mesh in enumerate(meshes)], truth), flush=True)
+            print(measure(name, captured(file, options.frames), None, alone=options.alone).text, flush=True)
+    found = []
+    for name, meshes, joints in rigs(options.data / "library", options.names, options.rigs, options.frames):
+        found.append(measure(name, meshes, joints, alone=options.alone))
+        print(found[-1].text, flush=True)
+    if found:
+        near, joints = (sum(getattr(each, word) for each in found) for word in ("near", "joints"))
+        print(
+            f"{len(found)} rigs: mean {sum(each.mean for each in found) / len(found):.2%}, worst "
+            f"{max(each.worst for each in found):.2%}; joints {near} of {joints}, {near / joints:.0%}; bones at most "
+            f"1.5 times as many in {sum(each.bones <= 1.5 * (each.joints + 1) for each in found)}"
+        )
 
 
 if __name__ == "__main__":

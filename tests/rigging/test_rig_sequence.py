@@ -8,6 +8,8 @@ import torch
 
 import torchreg as tr
 from tests.rigging.conftest import ANGLES, CONFIG, anew, posed
+from torchreg.datasets.figures import Part, meshed_figure
+from torchreg.datasets.solids import RoundCone
 from torchreg.errors import FramesWarning
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.neighbors import nearest_neighbor
@@ -26,6 +28,29 @@ def test_the_rig_follows_the_true_surface_and_bends_at_the_true_joint(arm, frame
     assert float(rig.errors.max()) < 0.01
     assert float(rig.confidence.min()) > 0.8
     assert int((rig.weights > 0).sum(1).max()) <= 4
+
+
+def test_limbs_that_move_alike_have_a_joint_each():
+    hips = (-0.6, 0.6)
+    parts = [Part("torso", None, (0.0, 0.0, 0.0), (RoundCone((-0.7, 0.0, 0.0), (0.7, 0.0, 0.0), 0.25, 0.25),))]
+    parts += [
+        Part(f"leg{side}", "torso", (hip, 0.0, 0.0), (RoundCone((hip, 0.0, 0.0), (hip, -1.1, 0.0), 0.16, 0.12),))
+        for side, hip in enumerate(hips)
+    ]
+    figure = meshed_figure(parts, spacing=0.05, blend=0.05, softness=0.05)
+    frames = []
+    for seed, angle in enumerate(ANGLES, 1):
+        turns = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)
+        turns[1:] = so3_exp(torch.tensor([angle, 0.0, 0.0], dtype=torch.float64))
+        vertices = figure.vertices(figure.transforms(turns.to(figure.mesh.vertices)))
+        frames.append(anew(tr.TriangleMesh(vertices, figure.mesh.faces), seed))
+    rig = tr.rig_sequence(frames, template=0, num_bones=3, config=CONFIG)
+    # Both legs turn about one axis: their motion alone is that of one bone, with a joint between them.
+    assert len(rig.joints) == 3
+    torch.testing.assert_close(rig.joints[1:, 0].sort().values, torch.tensor(hips).double(), atol=0.1, rtol=0)
+    feet = torch.tensor([[hip, -1.1, 0.0] for hip in hips], dtype=torch.float64)
+    owners = rig.weights[torch.cdist(feet, rig.shape.file_skin().points).argmin(1)].argmax(1)
+    assert rig.joints[owners, 0].sign().tolist() == [-1.0, 1.0]
 
 
 def test_a_rig_held_still_is_farther_away(frames, rig):

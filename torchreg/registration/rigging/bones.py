@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from torchreg.geometry.graphs import Graph, component_links, connected_components
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.upright import Y_UP, Direction
+from torchreg.registration.bones.joint_moments import JointMoments
+from torchreg.registration.bones.joints import Joints, bone_tree, find_joints
 from torchreg.registration.results import SequenceRegistration
-from torchreg.solvers.rigid_groups import merge_alike
+from torchreg.shapes.articulated import ArticulatedShape
 
 
 @dataclass(frozen=True)
@@ -24,65 +31,167 @@ _FORMAT = _Format()
 
 
 @dataclass(frozen=True)
-class BoneTree:
-    """A tree of B bones: weights (V, B) of the template's vertices, motions (T, B, 4, 4), joints (B, 3), parents."""
+class _Joining:
+    """What makes a connected part of a bone's surface a bone, and two of them neighbors."""
 
+    share: float = 0.005  # of all points
+    relative: float = 0.2  # of the points of the largest part of the bone
+    reach: float = 0.1  # diagonals from its own points, to which a bone is blended
+    turn: float = 0.3  # radians, at which motions locate a joint as well as the middle of what bones share does
+
+
+_JOINING = _Joining()
+
+
+@dataclass(frozen=True)
+class BoneTree:
+    """A tree of B bones of a surface's vertices (V, 3): weights (V, B), motions (T, B, 4, 4) from rest, joints (B, 3).
+
+    Parents stand before their children, the root first.
+    """
+
+    vertices: Tensor
     weights: Tensor
     motions: Tensor
     joints: Tensor
     parents: tuple[int, ...]
-    names: tuple[str, ...]
+
+    @classmethod
+    def of_sequence(cls, found: SequenceRegistration, mesh: TriangleMesh, scan: RangeScan) -> BoneTree:
+        """Return the bones of the template, a mesh and its coarse scan, as one tree: connected parts that move as one.
+
+        Limbs that move alike, as the two legs of a jump, have one label in a registration, and no joint in common.
+        """
+        edges, blended = _linked(scan), found.model.vertex_weights(scan.points).double()
+        parts = _Parts.of_owners(blended.argmax(1), edges, scan)
+        part, label = parts.part, parts.bone
+        motions, sizes = found.transforms.double()[:, label], torch.bincount(part).double()
+        middles = scan.points.new_zeros(len(label), 3).index_add(0, part, scan.points) / sizes[:, None]
+        joints = _joints(scan.points, parts.weights(scan.points, blended), edges, part, motions)
+        tree = bone_tree(joints, middles, sizes)
+        bones = cls(
+            vertices=mesh.vertices,
+            weights=parts.weights(mesh.vertices, found.model.vertex_weights(mesh.vertices).double()),
+            motions=motions,
+            joints=tree.origins,
+            parents=tree.parents,
+        )
+        return bones._chosen(_parents_first(tree.parents))
+
+    def __len__(self) -> int:
+        return len(self.parents)
+
+    @property
+    def names(self) -> list[str]:
+        """Names for files."""
+        return [f"bone_{number}" for number in range(len(self))]
+
+    def without(self, bone: int) -> BoneTree:
+        """Return the tree in which a bone, not the root, moves with its parent."""
+        target = self.parents[bone]
+        parents = tuple(target if parent == bone else parent for parent in self.parents)
+        weights = self.weights.clone()
+        weights[:, target] += weights[:, bone]
+        order = [other for other in _parents_first(parents) if other != bone]
+        return replace(self, weights=weights, parents=parents)._chosen(order)
+
+    def _chosen(self, order: Sequence[int]) -> BoneTree:
+        place = {bone: number for number, bone in enumerate(order)} | {-1: -1}
+        return replace(
+            self,
+            weights=self.weights[:, order],
+            motions=self.motions[:, order],
+            joints=self.joints[order],
+            parents=tuple(place[self.parents[bone]] for bone in order),
+        )
+
+    def pruned(self, alike: float, most: int) -> BoneTree:
+        """Return the tree without bones that never move their vertices farther than that from where parents would.
+
+        The mean over the vertices counts. Of more bones than ``most`` those that move least are left out, too.
+        """
+        bones = self
+        while len(bones) > 1:
+            owner = bones.weights.argmax(1)
+            apart = torch.zeros(len(bones) - 1).to(bones.weights)
+            for bone, parent in list(enumerate(bones.parents))[1:]:
+                own = bones.vertices[owner == bone]
+                one, other = (transform_points(bones.motions[:, each], own) for each in (bone, parent))
+                apart[bone - 1] = (one - other).norm(dim=-1).mean(-1).amax() if len(own) else 0.0
+            if float(apart.min()) > alike and len(bones) <= most:
+                break
+            bones = bones.without(int(apart.argmin()) + 1)
+        return bones
+
+    def shape(self, faces: Tensor, up: Direction | None = None) -> ArticulatedShape:
+        """Return the rig of ball joints, in double precision, with as many weights as files keep."""
+        values, index = self.weights.topk(min(_FORMAT.most_weights, len(self)), dim=1)
+        kept = torch.zeros_like(self.weights).scatter(1, index, values)
+        return ArticulatedShape.from_skinned_mesh(
+            self.vertices, faces, kept / kept.sum(1, keepdim=True), self.joints, self.parents,
+            joint_names=self.names, up=Y_UP if up is None else up, dtype=torch.float64,
+        )  # fmt: skip
 
 
-def tree_of_bones(found: SequenceRegistration, vertices: Tensor, alike: float) -> BoneTree:
-    """Return the bones that move vertices (V, 3) of the template, as one tree; ``alike`` is a share of the diagonal."""
-    tree = found.model.skeleton(found.transforms)
-    size = found.model.vertex_weights(found.points).double().sum(0)
-    parents = _one_tree(tree.parents, size)
-    part = _joined(found, parents, alike)
-    tops = [bone for bone, parent in enumerate(parents) if parent < 0 or part[parent] != part[bone]]
-    place = {part[bone]: number for number, bone in enumerate(tops)}
-    member = torch.tensor([place[number] for number in part])
-    weights = found.model.vertex_weights(vertices).double()
-    weights = torch.zeros(len(weights), len(tops), dtype=weights.dtype).index_add(1, member, weights)
-    return BoneTree(
-        weights=_largest(weights),
-        motions=found.transforms[:, [part[bone] for bone in tops]].double(),
-        joints=tree.origins[tops].double(),
-        parents=tuple(place[part[parents[bone]]] if parents[bone] >= 0 else -1 for bone in tops),
-        names=tuple(f"bone_{number}" for number in range(len(tops))),
-    )
+def _linked(scan: RangeScan) -> Tensor:
+    """Return the edges (E, 2) of a scan's triangles, and short links between loose pieces."""
+    faces = torch.zeros(0, 3, dtype=torch.long) if scan.faces is None else scan.faces
+    edges = torch.cat((faces[:, :2], faces[:, 1:], faces[:, ::2])).sort(dim=1).values.unique(dim=0)
+    return torch.cat((edges, component_links(scan.points, connected_components(edges, len(scan)))[0]))
 
 
-def _one_tree(parents: Sequence[int], size: Tensor) -> list[int]:
-    """Return parents in which all trees hang on the root of the largest bone of any."""
-    joined = list(parents)
-    roots = [bone for bone, parent in enumerate(joined) if parent < 0]
-    main = max(roots, key=lambda root: float(size[root]))
-    return [main if parent < 0 and bone != main else parent for bone, parent in enumerate(joined)]
+@dataclass(frozen=True)
+class _Parts:
+    """Connected parts of bones: the part (N,) of each point of a coarse scan, and the bone (P,) of each part."""
+
+    scan: RangeScan
+    part: Tensor
+    bone: Tensor
+
+    @classmethod
+    def of_owners(cls, owner: Tensor, edges: Tensor, scan: RangeScan) -> _Parts:
+        """Return the parts of bones that own points (N,); points of small parts belong to the part around them."""
+        region = connected_components(edges[owner[edges[:, 0]] == owner[edges[:, 1]]], len(owner))
+        size = torch.bincount(region)[region]
+        largest = torch.zeros(int(owner.max()) + 1).scatter_reduce(0, owner, size.float(), "amax")
+        least = (_JOINING.relative * largest).clamp_min(_JOINING.share * len(owner)).minimum(largest)
+        kept = (size >= least[owner]).nonzero()[:, 0]
+        numbers, part = region[kept].unique(return_inverse=True)
+        nearest = Graph.from_edges(edges, torch.ones(len(edges)), len(owner)).nearest(kept)[1]
+        return cls(scan, part[nearest], torch.zeros_like(numbers).index_copy(0, part, owner[kept]))
+
+    def weights(self, points: Tensor, weights: Tensor) -> Tensor:
+        """Return weights (V, P) of points (V, 3) for those of bones (V, B): what a bone weighs is of its nearest part.
+
+        Where a bone has no part near, the part around the point moves what it moved.
+        """
+        around = self.part[nearest_neighbor(points, self.scan.points)[0]]
+        found = weights.new_zeros(len(points), len(self.bone))
+        for bone in self.bone.unique().tolist():
+            own = (self.bone[self.part] == bone).nonzero()[:, 0]
+            index, distance = nearest_neighbor(points, self.scan.points[own])
+            near = distance < _JOINING.reach * self.scan.diagonal
+            found.scatter_add_(1, self.part[own[index]][:, None], (weights[:, bone] * near)[:, None])
+        rest = weights.sum(1) - found.sum(1)
+        return found.scatter_add(1, around[:, None], rest.clamp_min(0)[:, None])
 
 
-def _joined(found: SequenceRegistration, parents: Sequence[int], alike: float) -> list[int]:
-    """Return the part of each bone, the number of one of its bones: joints at which nothing turns join two bones."""
-    points, moved = found.points.double(), found.deformed.double()
-    size = float((points.amax(0) - points.amin(0)).norm())
-    members = nn.functional.one_hot(found.labels, len(parents)).double()
-    residuals = torch.stack([
-        torch.stack([(transform_points(bone, points) - frame).norm(dim=-1) for bone in motions]) @ members / size
-        for motions, frame in zip(found.transforms.double(), moved, strict=True)
-    ])  # fmt: skip
-    joints = torch.zeros(len(parents), len(parents), dtype=torch.bool)
-    counts = members.sum(0)
-    part = list(range(len(parents)))
-    for bone, parent in enumerate(parents):
-        if parent >= 0:
-            joints[bone, parent] = joints[parent, bone] = True
-    merged: list[int] = merge_alike(residuals, counts, joints, alike).tolist()
-    # Bones that own no point move with their parents, parents first.
-    for bone in _parents_first(parents):
-        idle = float(counts[bone]) == 0 and parents[bone] >= 0
-        part[bone] = part[parents[bone]] if idle else merged[bone]
-    return part
+def _joints(points: Tensor, weights: Tensor, edges: Tensor, part: Tensor, motions: Tensor) -> Joints:
+    """Return the joints of parts with a common border, by edges (E, 2); mass tells how likely two are joined.
+
+    Joined parts have a long border, whose middle both move alike: limbs that touch have a short one, which tears.
+    ``weights`` (N, P) say where parts blend.
+    """
+    edges = edges[part[edges[:, 0]] != part[edges[:, 1]]]
+    pairs, pair = part[edges].sort(dim=1).values.unique(dim=0, return_inverse=True)
+    border, ends = torch.bincount(pair, minlength=len(pairs)).to(points), points[edges]
+    shared = weights[:, pairs[:, 0]] * weights[:, pairs[:, 1]]
+    center = (shared.mT @ points).index_add(0, pair, ends.mean(1)) / (shared.sum(0) + border)[:, None]
+    length = torch.full_like(border, torch.inf).scatter_reduce(0, pair, (ends[:, 0] - ends[:, 1]).norm(dim=-1), "amin")
+    moments = JointMoments(pairs, border, center, center.new_zeros(len(pairs), 3, 3))
+    found = find_joints(moments, motions, regularization=_JOINING.turn**2)
+    off = found.gaps.mean(0) + (found.centers - center).norm(dim=-1) + length
+    return replace(found, mass=border / off)
 
 
 def _parents_first(parents: Sequence[int]) -> list[int]:
@@ -90,10 +199,3 @@ def _parents_first(parents: Sequence[int]) -> list[int]:
     for bone in order:
         order += [child for child, parent in enumerate(parents) if parent == bone]
     return order
-
-
-def _largest(weights: Tensor) -> Tensor:
-    """Return weights (V, B) with as many of the largest as files keep, rows summing to one."""
-    values, index = weights.topk(min(_FORMAT.most_weights, weights.shape[1]), dim=1)
-    kept = torch.zeros_like(weights).scatter(1, index, values)
-    return kept / kept.sum(1, keepdim=True)

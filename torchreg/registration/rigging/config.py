@@ -20,7 +20,7 @@ class RigConfig:
         width: distances at which a match counts less, in the first round and in the last.
         along: weight of a match along the surface, where vertices of different meshes do not correspond.
         stay: how far a turn by one radian from the neighbor in time counts, as a distance.
-        alike: bones of one joint are one where the motion of either leaves the other's points that near, on average.
+        alike: a bone whose points its parent moves as near as that, on average, in every frame is part of it.
         doubtful: mean distance from the surface above which a frame is not explained.
         register: of the scan registration that finds bones.
 
@@ -35,7 +35,7 @@ class RigConfig:
     width: tuple[float, float] = (0.05, 0.01)
     along: float = 0.1
     stay: float = 0.0006
-    alike: float = 0.008
+    alike: float = 0.005
     doubtful: float = 0.025
     register: RegisterConfig = field(default_factory=RegisterConfig)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import NeighborTree
+from torchreg.geometry.neighbors import NeighborTree, nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rotation import so3_log
 from torchreg.registration.rigging.config import RigConfig
@@ -31,14 +31,13 @@ class _Matching:
 _MATCHING = _Matching()
 
 
-def poses_of_motions(shape: ArticulatedShape, names: Sequence[str], parents: Sequence[int], motions: Tensor) -> Tensor:
+def poses_of_motions(shape: ArticulatedShape, motions: Tensor) -> Tensor:
     """Return poses (T, D) in which bones turn as motions (T, B, 4, 4) from rest do; only the root's shifts are kept."""
     turns = motions[..., :3, :3]
     pose = shape.rest_pose().double().repeat(len(motions), 1)
-    root = list(parents).index(-1)
-    pose[:, :3], pose[:, 3:BASE_DOFS] = motions[:, root, :3, 3], so3_log(turns[:, root].contiguous())
+    pose[:, :3], pose[:, 3:BASE_DOFS] = motions[:, 0, :3, 3], so3_log(turns[:, 0].contiguous())
     place = {name: number for number, name in enumerate(shape.dof_names)}
-    for bone, parent in enumerate(parents):
+    for bone, parent in enumerate(shape.part_parents):
         if parent < 0:
             continue
         local = turns[:, parent].mT @ turns[:, bone]
@@ -48,7 +47,7 @@ def poses_of_motions(shape: ArticulatedShape, names: Sequence[str], parents: Seq
             torch.atan2(-local[:, 0, 1], local[:, 0, 0]),
         )
         for axis, angle in zip("xyz", angles, strict=True):
-            pose[:, place[f"{names[bone]}_{axis}"]] = angle
+            pose[:, place[f"{shape.part_names[bone]}_{axis}"]] = angle
     return pose.to(shape.rest)
 
 
@@ -63,8 +62,14 @@ class FittedPose:
 class SurfaceFitter:
     """Fits poses of a rig to coarse scans by matches both ways, ever narrower."""
 
-    def __init__(self, skin: LinearBlendSkin, size: float, config: RigConfig) -> None:
-        self.skin, self.size, self.config = skin, size, config
+    def __init__(self, shape: ArticulatedShape, scan: RangeScan, config: RigConfig) -> None:
+        """Take a rig, and a coarse scan of its surface whose points are vertices of it."""
+        full = shape.file_skin()
+        self.index, _ = nearest_neighbor(scan.points, full.points)
+        self.skin = LinearBlendSkin(
+            shape, full.points[self.index], full.weights[self.index], full.reference_pose, normals=scan.normals
+        )
+        self.shape, self.size, self.config = shape, float(scan.diagonal), config
 
     def fit(self, scan: RangeScan, starts: Sequence[Tensor]) -> FittedPose:
         """Return the best pose found from several starts (D,), the last of which is that of the neighbor in time."""
@@ -95,8 +100,7 @@ class SurfaceFitter:
     def _linearized(self, target: _Target, pose: Tensor, neighbor: Tensor, width: float) -> Linearization:
         """Return matches both ways at a pose (D,) as one least-squares problem, with a prior about the neighbor."""
         points, jacobian = self.skin.jacobian(pose, chart="tangent")
-        normals = self.skin.posed_normals(pose)
-        index, back = target.match(points, normals)
+        index, back = target.match(points, self.skin.posed_normals(pose))
         model = torch.cat((torch.arange(len(points)), back))
         data = torch.cat((index, torch.arange(len(target.points))))
         residual = (points[model] - target.points[data]) / self.size
@@ -104,25 +108,21 @@ class SurfaceFitter:
         sizes = torch.tensor([len(index), len(back)]).repeat_interleave(torch.tensor([len(index), len(back)]))
         # Beyond the border of a scan the surface goes on unseen.
         seen = torch.cat((target.inside[index], target.inside.new_ones(len(back))))
-        weight = weight * seen / sizes
         direction = target.normals[data]
-        along = self.config.along
-        # Sums over the matches of each model point make the product with the Jacobian small.
-        metric = weight[:, None, None] * (
-            direction[:, :, None] * direction[:, None, :] + along * torch.eye(3, dtype=points.dtype)
+        metric = (weight * seen / sizes)[:, None, None] * (
+            direction[:, :, None] * direction[:, None, :] + self.config.along * torch.eye(3, dtype=points.dtype)
         )
         weighted = (metric @ residual[:, :, None])[..., 0]
+        # Sums over the matches of each model point make the product with the Jacobian small.
         count = len(points)
         metrics = metric.new_zeros(count, 3, 3).index_add(0, model, metric)
         forces = weighted.new_zeros(count, 3).index_add(0, model, weighted)
         scaled = jacobian / self.size
         flat = scaled.reshape(-1, scaled.shape[-1])
-        hessian = flat.mT @ (metrics @ scaled).reshape(flat.shape)
-        gradient = flat.mT @ forces.reshape(-1)
         joints = torch.zeros_like(pose)
         joints[BASE_DOFS:] = self.config.stay**2
-        gradient = gradient + joints * difference(neighbor, pose)
-        hessian = hessian + torch.diag(joints)
+        gradient = flat.mT @ forces.reshape(-1) + joints * difference(neighbor, pose)
+        hessian = flat.mT @ (metrics @ scaled).reshape(flat.shape) + torch.diag(joints)
         return Linearization(gradient.new_zeros(1), gradient[None], hessian[None])
 
 

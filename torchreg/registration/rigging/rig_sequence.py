@@ -13,11 +13,9 @@ from torchreg._checks import check_count
 from torchreg._threads import one_thread
 from torchreg.errors import FramesWarning
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.geometry.range_scan import RangeScan
-from torchreg.geometry.upright import Y_UP, Direction
+from torchreg.geometry.upright import Direction
 from torchreg.registration.register_sequence import register_sequence
-from torchreg.registration.rigging.bones import tree_of_bones
+from torchreg.registration.rigging.bones import BoneTree
 from torchreg.registration.rigging.config import RigConfig
 from torchreg.registration.rigging.distances import SurfaceSamples, two_way_distance
 from torchreg.registration.rigging.frames import RigFrames, usable_frames
@@ -25,7 +23,6 @@ from torchreg.registration.rigging.poses import SurfaceFitter, poses_of_motions
 from torchreg.registration.rigging.results import SequenceRig
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin
 
 # Called with the name of the stage that a step belongs to.
 OnStep = Callable[[str], None]
@@ -101,43 +98,31 @@ def _rigged(
         [frames.scans[row] for row in rows], count, config.cells, config.register,
         on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
     )  # fmt: skip
-    bones = tree_of_bones(found, frames.mesh.vertices, config.alike)
-    shape = ArticulatedShape.from_skinned_mesh(
-        frames.mesh.vertices, frames.mesh.faces, bones.weights, bones.joints, bones.parents,
-        joint_names=bones.names, up=Y_UP if up is None else up, dtype=torch.float64,
-    )  # fmt: skip
-    starts = dict(zip(rows, poses_of_motions(shape, bones.names, bones.parents, bones.motions), strict=True))
-    poses, errors = _fitted_poses(shape, starts, frames, config, step)
-    return shape, poses, errors
+    scan = frames.scans[frames.template]
+    bones = BoneTree.of_sequence(found, frames.mesh, scan).pruned(config.alike * float(scan.diagonal), count)
+    fitter = SurfaceFitter(bones.shape(frames.mesh.faces, up), scan, config)
+    starts = dict(zip(rows, poses_of_motions(fitter.shape, bones.motions), strict=True))
+    return fitter.shape, *_fitted_poses(fitter, starts, frames, step)
 
 
 def _fitted_poses(
-    shape: ArticulatedShape, starts: Mapping[int, Tensor], frames: RigFrames, config: RigConfig, step: OnStep
+    fitter: SurfaceFitter, starts: Mapping[int, Tensor], frames: RigFrames, step: OnStep
 ) -> tuple[Tensor, Tensor]:
     """Return poses (T, D) of all frames and their errors (T,), from the template outward, from starts of some."""
-    size, skin = float(frames.scans[frames.template].diagonal), shape.file_skin()
-    fitter = SurfaceFitter(_coarse_skin(skin, frames.scans[frames.template]), size, config)
+    shape, skin = fitter.shape, fitter.shape.file_skin()
     poses = shape.rest_pose().repeat(len(frames.scans), 1)
     errors = poses.new_zeros(len(poses))
     for direction, end in ((1, len(poses)), (-1, -1)):
         neighbor = poses[frames.template]
         for frame in range(frames.template + direction, end, direction):
             best = fitter.fit(frames.scans[frame], [*([starts[frame]] if frame in starts else []), neighbor])
-            rig = SurfaceSamples.of_mesh(TriangleMesh(skin(best.pose), frames.mesh.faces))
             poses[frame] = best.pose
-            errors[frame] = two_way_distance(rig, frames.surfaces[frame], frames.scans[frame]) / size
-            if errors[frame] <= config.doubtful:
+            rig = SurfaceSamples.of_mesh(TriangleMesh(skin(best.pose), frames.mesh.faces))
+            errors[frame] = two_way_distance(rig, frames.surfaces[frame], frames.scans[frame]) / fitter.size
+            if errors[frame] <= fitter.config.doubtful:
                 neighbor = poses[frame]
             step("poses")
     return poses, errors
-
-
-def _coarse_skin(full: LinearBlendSkin, scan: RangeScan) -> LinearBlendSkin:
-    """Return the skin of a coarse template scan, whose points are vertices of the rig's surface."""
-    index, _ = nearest_neighbor(scan.points, full.points)
-    return LinearBlendSkin(
-        full.shape, full.points[index], full.weights[index], full.reference_pose, normals=scan.normals
-    )
 
 
 def _result(
