@@ -100,7 +100,7 @@ def test_a_result_is_in_doubt_where_the_picture_shows_something_else(plain_hand,
         for picture in (depth, ball())
     )
     assert found.status.usable
-    assert float(found.evidence[-2]) < 0.3 < PICTURE_MODEL.told < float(other.evidence[-2])
+    assert float(found.evidence[-2]) < 0.1 < PICTURE_MODEL.told**2 < float(other.evidence[-2])
     assert other.status in (tr.Status.DOUBTFUL, tr.Status.NOT_FOUND)
     assert "the picture more probably shows something else" in other.doubt
 
