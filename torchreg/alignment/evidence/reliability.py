@@ -296,6 +296,12 @@ def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> T
     return calibration.probability(evidence)
 
 
+def shown_probability(evidence: Tensor) -> Tensor:
+    """Return the probability (...) that a whole picture shows the shape about where a pose of evidence (..., E) is."""
+    names = [item.name for item in fields(Evidence)]
+    return 1 - evidence[..., names.index("elsewhere")].sqrt()
+
+
 def _turns(pose: Tensor, rivals: Tensor | None) -> list[str]:
     """Return by how much the base of rivals (B, R, num_dofs) is turned from that of poses, in words for each pose."""
     if rivals is None:
