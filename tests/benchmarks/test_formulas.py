@@ -1,6 +1,7 @@
 """What benchmarks compute themselves, by hand, by tables and in closed form."""
 
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -97,6 +98,26 @@ def test_true_correspondences_have_the_largest_logits(load):
     logits = load("scan_matching").true_logits(truth, places, tensor([True, True, False]))
     assert logits[:-1].argmax(1).tolist() == [1, 0, 3]
     assert logits[:, :2].argmax(0).tolist() == [1, 0]
+
+
+def test_each_family_has_a_bias_of_its_own_and_each_case_is_judged_by_models_of_others(load):
+    bench, generator, cases = load("calibrate_confidence"), torch.Generator().manual_seed(0), []
+    truths = {"hand": 2.0, "rig": 0.5, bench.ROOM: 1.0}
+    for seed in range(3000):
+        family, evidence = list(truths)[seed % 3], torch.rand(2, generator=generator)
+        odds = truths[family] - evidence @ tensor([4.0, 1.0])
+        cases.append(bench.Judged(
+            kind=family, family=family, seed=seed, told=(), ends=None, near=True, is_answer=True, evidence=evidence,
+            right=bool(torch.rand((), generator=generator) < odds.sigmoid()),
+        ))  # fmt: skip
+    models = bench.fitted_poses(cases)
+    assert models["hand"].weights == models["rig"].weights
+    every = torch.stack([case.evidence for case in cases])
+    for family, bias in truths.items():
+        true = (bias - every @ tensor([4.0, 1.0])).sigmoid()
+        assert float((models[family].probability(every) - true).abs().mean()) < 0.05
+    table = bench.render(cases, bench.crossed(cases))
+    assert re.search(r"hand +1000 answers: mean confidence (\S+), right .*area under the curve 0.[78]", table)
 
 
 def test_each_case_is_judged_by_the_other_cases(load):

@@ -50,8 +50,8 @@ class Evidence:
         rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
         open_rim: square of `open_rims`; zero for clouds.
         planes: square of `planes_instead`.
-        elsewhere: probability by a whole picture that it shows something else, see `PictureModel`; else zero.
-        misplaced: mean probability by a whole picture that a limb is elsewhere, see `LimbModel`; else zero.
+        elsewhere: square of the probability by a whole picture that it shows something else, see `PictureModel`.
+        misplaced: mean probability by a whole picture that a limb is elsewhere, see `LimbModel`; both else zero.
     """
 
     noise: Tensor
@@ -106,7 +106,7 @@ CALIBRATION = Calibration()
 # Of shapes in whole pictures, where most that is found is something else, or right but for a limb. Fitted by the same
 # command to 183 judgements of crops of 42 made-up rooms, 18 of them right; all of hands: of few arms is one found.
 PICTURE_CALIBRATION = Calibration(
-    bias=2.66, weights=(0.0, 2.08, 1.06, 0.0, 7.31, 1.41, 0.0, 4.05, 5.3, 1.37, 5.01, 3.07)
+    bias=2.27, weights=(0.0, 2.82, 1.2, 0.18, 7.27, 1.11, 0.15, 4.18, 5.93, 1.32, 5.92, 3.37)
 )
 # Of fits of pose and shape together, which are right if all of the surface, hidden parts too, is off by at most that
 # share of the size on average: 25 mm of a body of 1.7 m. What is unknown is then the standard error of the surface,
@@ -203,7 +203,7 @@ def judge(
         rims, planes = open_rims(problem, pose, frames), planes_instead(problem, residuals.distance)
         evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
         if in_picture:
-            evidence = replace(evidence, elsewhere=picture.elsewhere, misplaced=picture.misplaced.mean(-1))
+            evidence = replace(evidence, elsewhere=picture.elsewhere.square(), misplaced=picture.misplaced.mean(-1))
         residuals = replace(residuals, contradicted=picture.contradicted)
         loose = loose | (picture.misplaced > _SCALES.loose_limb)
     around, calibration = curvature(problem, pose, residuals), PICTURE_CALIBRATION if in_picture else CALIBRATION
@@ -296,6 +296,12 @@ def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> T
     return calibration.probability(evidence)
 
 
+def shown_probability(evidence: Tensor) -> Tensor:
+    """Return the probability (...) that a whole picture shows the shape about where a pose of evidence (..., E) is."""
+    names = [item.name for item in fields(Evidence)]
+    return 1 - evidence[..., names.index("elsewhere")].sqrt()
+
+
 def _turns(pose: Tensor, rivals: Tensor | None) -> list[str]:
     """Return by how much the base of rivals (B, R, num_dofs) is turned from that of poses, in words for each pose."""
     if rivals is None:
@@ -335,7 +341,7 @@ _REASONS = (
     ("free_space", 0.2, "parts of the shape lie where the picture shows nothing"),
     ("open_rim", 0.25, "the surface goes on where the shape ends, as a wall or a table does"),
     ("planes", 0.2, "flat faces explain the data better than the shape"),
-    ("elsewhere", PICTURE_MODEL.told, "the picture more probably shows something else"),
+    ("elsewhere", PICTURE_MODEL.told**2, "the picture more probably shows something else"),
 )
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL
+from torchreg.alignment.evidence.reliability import CALIBRATION, shown_probability
 from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.capture.depth_frame import DepthFrame
@@ -20,8 +21,8 @@ from torchreg.shapes.skin import LinearBlendSkin
 class Choice:
     """How the crops of a picture are tried."""
 
-    sure: float = 0.8  # confidence from which on no other crop is tried
-    enough: float = CALIBRATION.doubtful  # from which on no surface farther away is
+    shown: float = PICTURE_MODEL.told  # probability that a crop shows the shape from which on no other crop is tried
+    enough: float = CALIBRATION.doubtful  # confidence from which on no surface farther away is, nor other poses near
     not_found: float = 0.05  # below which the best pose is rejected, at the usual level of a test
 
 
@@ -49,7 +50,7 @@ def align_in_picture(
     """
     quick = replace(config, search="never")
     found, crop = surest_crop(frame, model_size(skin), lambda crop: aligned(crop, config=quick), crop_score)
-    if _confidence(found) < CHOICE.sure and config.search != "never" and found.coefficients is None:
+    if _confidence(found) < CHOICE.enough and config.search != "never" and found.coefficients is None:
         found = aligned(crop, config=config)
     return replace(_not_found_if_improbable(found), crop=crop.mask)
 
@@ -67,7 +68,7 @@ def surest_crop(
             found = answer(crop)
             if best is None or _confidence(found) > _confidence(best[0]):
                 best = found, crop
-            if _confidence(found) >= CHOICE.sure:
+            if _shown(found) >= CHOICE.shown:
                 return best
         # Farther surfaces are tried where no end of a nearer one may be the shape.
         if best is not None and _confidence(best[0]) >= CHOICE.enough:
@@ -98,3 +99,8 @@ def _likely_first(
 
 def _confidence(found: Any) -> float:
     return float(found.confidence)
+
+
+def _shown(found: Any) -> float:
+    """Return the probability that a crop shows the shape about where a pose is, or that a start is right."""
+    return float(shown_probability(found.evidence)) if isinstance(found, AlignResult) else _confidence(found)
