@@ -148,8 +148,8 @@ def track(
     With --depth --intrinsics FILE frames are depth pictures, and their free space counts too. Keypoints that a detector
     found, --keypoints, count with any frames.
 
-    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data, or an output other than
-    the result could not be written; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if in any frame the shape was lost, not found or is doubtful, or there were no data, or an output
+    other than the result could not be written; 2 for an error; 130 for Ctrl-C.
     """
     result = with_ending(output, (".safetensors",), add=True)
     from torchreg._checks import check_positive
