@@ -23,7 +23,6 @@ def test_a_body_is_followed_in_its_clothes(body, thickness, clothed):  # noqa: F
     steps = [torch.tensor([0.01 * number, 0, 0]) for number in range(FRAMES)]
     skins = [body.vertices(result.pose, result.coefficients) for result in results]
     errors = [float((skin - truth - step).norm(dim=-1).mean()) for skin, step in zip(skins, steps, strict=True)]
-    print(errors, [result.status for result in results])
     assert all(len(result.coefficients) == 2 for result in results)
     if wears or not thickness:
         assert errors[-1] < 1.2 * errors[0] + 0.002

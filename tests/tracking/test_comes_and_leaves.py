@@ -3,7 +3,6 @@
 from itertools import groupby
 
 import pytest
-import torch
 
 import torchreg as tr
 from torchreg.datasets.sequences import hand_sequence
