@@ -7,7 +7,7 @@ points are of all sides. The error is the distance of every vertex, hidden ones 
 `pip install "torchreg-articulated[anny]"`.
 
     python benchmarks/body_tracking.py                         # made-up people, 100 frames
-    python benchmarks/body_tracking.py --smooth                # also what the second pass makes of them
+    python benchmarks/body_tracking.py --smooth                # what the second pass makes of them
     python benchmarks/body_tracking.py --data DIR              # captured people: DIR/samba.npz, DIR/captured_people
 
 Of samba the vertices are followed through all frames: each is bound in the first frame to the nearest place of the body
@@ -125,18 +125,26 @@ class Followed:
     seconds: list[float]
 
 
-def follow(shape: tr.ArticulatedShape, clip: Clip) -> Followed:
-    """Return what a tracker makes of a clip."""
+def follow(shape: tr.ArticulatedShape, clip: Clip, *, smooth: bool = False) -> Followed:
+    """Return what a tracker makes of a clip, and a second pass where that is wanted."""
     tracker = tr.Tracker(shape, clip.start, fit_shape=True, config=tr.TrackConfig(upright=clip.up))
-    bodies, statuses, confidences, seconds = [], [], [], []
-    for points in clip.data:
-        before = time.process_time()
-        result = tracker.step(points.float())
-        seconds.append(time.process_time() - before)
+    bodies, statuses, confidences, ticks = [], [], [], [time.process_time()]
+    data = [points.float() for points in clip.data]
+
+    def note(points: Tensor, result: tr.FrameResult) -> None:
+        ticks.append(time.process_time())
         bodies.append(shape.vertices(result.pose, result.coefficients).double())
         statuses.append(result.status)
         confidences.append(float(result.confidence))
-    return Followed(bodies, statuses, confidences, seconds)
+
+    track = tracker.run(data, note)
+    seconds = torch.tensor(ticks, dtype=torch.float64).diff().tolist()
+    if not smooth:
+        return Followed(bodies, statuses, confidences, seconds)
+    again = tr.smooth_track(track, data)
+    bodies = [shape.vertices(pose, track.coefficients).double() for pose in again.poses]
+    spent = (time.process_time() - ticks[-1]) / len(bodies)
+    return Followed(bodies, statuses, confidences, [value + spent for value in seconds])
 
 
 def vertex_errors(found: Followed, clip: Clip) -> Tensor:
@@ -188,6 +196,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="seed")
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--whole", action="store_true", help="scans of all sides")
+    parser.add_argument("--smooth", action="store_true", help="with the second pass")
     parser.add_argument("--data", type=Path, help="folder with samba.npz and captured_people, in place of made-up ones")
     options = parser.parse_args()
     if find_spec("anny") is None:
@@ -198,13 +207,13 @@ def main() -> int:
     if options.data is None:
         for seed in range(options.first, options.first + options.seeds):
             clip = made_up(shape, seed, options.frames, whole=options.whole)
-            found = follow(shape, clip)
+            found = follow(shape, clip, smooth=options.smooth)
             met &= report(f"seed {seed}", vertex_errors(found, clip), found)
         return 0 if met else 1
     paths = [options.data / "samba.npz", *sorted((options.data / "captured_people").glob("*.npz"))]
     for path in filter(Path.exists, paths):
         clip = captured(path, options.frames)
-        found = follow(shape, clip)
+        found = follow(shape, clip, smooth=options.smooth)
         if path == paths[0]:
             met &= report(f"{path.stem}, points followed", material_errors(found, clip, faces), found)
         report(f"{path.stem}, surfaces", surface_errors(found, clip, faces), found)

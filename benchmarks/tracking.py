@@ -159,6 +159,13 @@ def least_squares(hand: tr.Hand, clouds: Sequence[HandCloud]) -> Tensor:
         return 1e3 * (hand.keypoints(torch.stack(poses)) - true).norm(dim=-1)[:, TIPS]
 
 
+def smoothed_errors(tracked: Track, clouds: Sequence[HandCloud], config: tr.TrackConfig) -> Tensor:
+    """Return errors (T, 5) in mm of fingertips after a second pass over all frames."""
+    result = tr.smooth_track(tracked.result, [cloud.points for cloud in clouds], config=config)
+    true = torch.stack([cloud.keypoints for cloud in clouds])
+    return 1e3 * (result.keypoints - true).norm(dim=-1)[:, TIPS]
+
+
 def frames_back(tracked: Track, clouds: Sequence[HandCloud]) -> list[int]:
     """Return after how many frames from the end of each flip the seen fingertips are under 5 mm again, on average."""
     turns = torch.stack([cloud.pose[3:6] for cloud in clouds])
@@ -176,6 +183,8 @@ def exact_lines(hand: tr.Hand, config: tr.TrackConfig, frames: int, seeds: Seque
         tracks = [track(tr.Tracker(hand, config=config), sequence) for sequence in clouds]
         least = torch.cat([least_squares(hand, sequence) for sequence in clouds])
         errors, seen = (torch.cat([getattr(one, name) for one in tracks]) for name in ("errors", "seen"))
+        pairs = zip(tracks, clouds, strict=True)
+        second = torch.cat([smoothed_errors(one, sequence, config) for one, sequence in pairs])
         worst, in_view = (torch.cat([getattr(one, name) for one in tracks]) for name in ("worst", "in_view"))
         seconds = torch.cat([one.result.seconds[STARTED:] for one in tracks])
         busy = torch.cat([one.busy[STARTED:] for one in tracks])
@@ -184,11 +193,13 @@ def exact_lines(hand: tr.Hand, config: tr.TrackConfig, frames: int, seeds: Seque
         lines += [
             Line(motion, "seen fingertips, mean mm", float(errors[seen].mean()), MEAN_BAR),
             Line(motion, "the same by least squares from the truth", float(least[seen].mean())),
+            Line(motion, "the same after the second pass", float(second[seen].mean()), float(errors[seen].mean())),
             Line(
                 motion, "share of frames with the worst <= 5 mm", float((worst <= WORST_BAR).double().mean()), bar, True
             ),
             Line(motion, "median of frames in view, worst mm", float(worst[in_view].median())),
             Line(motion, "hidden fingertips, mean mm", float(errors[~seen].mean())),
+            Line(motion, "the same after the second pass", float(second[~seen].mean())),
             Line(motion, "frames lost in view", sum(one.lost for one in tracks), None if motion == "flip" else 0),
             Line(motion, "frames/s after the start", float(1 / seconds.mean()), RATE_BAR, True),
             Line(motion, "the same by processor time", float(1 / busy.mean())),

@@ -203,7 +203,7 @@ class Status(Enum):
     NO_DATA = "no_data"
     LOST = "lost"
     OTHER_UNITS = "other_units"
-    NOT_FOUND = "not_found"  # in a picture: it is not there, or the search missed it
+    NOT_FOUND = "not_found"  # in a picture or a sequence: it is not there, or the search missed it
     DOUBTFUL = "doubtful"  # a result that its own evidence speaks against
     DEGENERATE = "degenerate"  # data at one place, on a line or on a plane, which determine no pose
 

@@ -186,6 +186,8 @@ def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of
     written = tr.ArticulatedShape.from_gltf(tmp_path / "new.glb", parents=joined)
     torch.testing.assert_close(written(found.pose).points, found.shape(found.pose).points, atol=1e-5, rtol=0)
     assert "--rig has no meaning without --fit-shape" in error_of(*common, "--rig", tmp_path / "n.glb")
+    assert "--clothed has no meaning without --fit-shape" in error_of(*common, "--clothed", "yes")
+    assert "--clothed must be one of auto, yes, no" in error_of(*common, "--fit-shape", "--clothed", "maybe")
     hand = "align", "hand", tmp_path / "cloud.ply", "--fit-shape", "--rig", tmp_path / "n.glb"
     assert "--rig has no meaning for hand" in error_of(*hand)
 

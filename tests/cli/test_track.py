@@ -206,6 +206,19 @@ def test_an_interruption_while_a_frame_is_drawn_leaves_no_hole(run, command, who
     assert same(tr.load(tmp_path / "r.safetensors"), whole)
 
 
+def test_a_complete_run_is_smoothed_at_its_end_or_later(done, command, whole, sequence, tmp_path):
+    frames = [tr.load_points(path).points for path in sorted((sequence / "frames").iterdir())]
+    wanted = tr.smooth_track(whole, frames)
+    done(*command(*FAST, "--smooth"))
+    once = tr.load(tmp_path / "r.safetensors")
+    torch.testing.assert_close(once.poses, wanted.poses, atol=1e-4, rtol=0)
+    assert once.statuses == whole.statuses
+    done(*command(*FAST, out="s"))
+    assert not torch.equal(tr.load(tmp_path / "s.safetensors").poses, once.poses)
+    done(*command(*FAST, "--smooth", "--resume", out="s"))
+    torch.testing.assert_close(tr.load(tmp_path / "s.safetensors").poses, once.poses)
+
+
 def test_frames_that_came_later_are_added(run, command, whole, tmp_path, monkeypatch):
     some = [f"frames/frame_000{k}.ply" for k in range(4)]
     every = [*some, *(f"frames/frame_000{k}.ply" for k in (4, 5))]
@@ -311,7 +324,7 @@ def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
         "--pictures", tmp_path / "live",
     )  # fmt: skip
     assert answer.exit_code == 1, answer.output
-    assert "1 frame: 0 tracked, 1 lost" in answer.output
+    assert "1 frame: 0 tracked, 1 not_found" in answer.output
     names = ["live", "r.gif", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert not tr.load(tmp_path / "r.safetensors").poses.isfinite().any()
@@ -347,6 +360,8 @@ def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
     ({"frames": ["start.json"]}, "has the unknown ending '.json'"),
     (("--start", "none.json"), "none.json: No such file or directory"),
     (("--movie", "avi"), "--movie must be one of gif, mp4, none; got 'avi'"),
+    (("--clothed", "no"), "--clothed has no meaning without --fit-shape"),
+    (("--clothed", "maybe", "--fit-shape"), "--clothed must be one of auto, yes, no"),
     (("--fps", 0), "--fps must be positive"),
     (("--scale", -1), "--scale must be positive"),
     (("--prediction", "maybe"), "prediction must be one of velocity, none"),

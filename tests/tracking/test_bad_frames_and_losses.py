@@ -65,14 +65,14 @@ def test_what_is_nowhere_stays_unknown_and_is_searched_ever_more_rarely(noise_fr
     searched = []
     find(lambda number: searched.append(made.state.frame) or truths[:1] + 2.0, [300.0])
     result = made.run([noise_frame(seed=k) for k in range(30)])
-    assert set(result.statuses) == {tr.Status.LOST}
+    assert set(result.statuses) == {tr.Status.NOT_FOUND}
     assert result.poses.isnan().all()
     assert result.keypoints.isnan().all()
     assert not made.state.found
     # After the second failure in a row, each cool-down is twice as long.
     assert [later - earlier for earlier, later in pairwise(sorted(set(searched)))] == [1, 3, 5, 9]
     before = len(searched)
-    assert tracker(None, recovery="none").step(noise_frame()).status is tr.Status.LOST
+    assert tracker(None, recovery="none").step(noise_frame()).status is tr.Status.NOT_FOUND
     assert len(searched) == before
 
 
@@ -170,7 +170,7 @@ def test_what_lies_beside_its_data_is_searched_again_until_a_pose_explains_them(
     assert num_data == 3000
     # Searches everywhere end without a pose.
     calls = find(moved(tracking.pose, 0.5)[None], [10.0])
-    assert tracking.step(state)[0].status is tr.Status.LOST
+    assert tracking.step(state)[0].status is tr.Status.NOT_FOUND
     assert [config.seed for _, config in calls] == [0, 1, 2, 3]
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import (
+    Clothed,
     FitShape,
     Frame,
     NanPolicy,
@@ -23,6 +24,7 @@ from torchreg.cli.align_options import (
     cloud_files,
     fitted_shape,
     person_summary,
+    read_clothed,
     read_cloud,
     read_schedule,
 )
@@ -71,6 +73,7 @@ def align(
     ] = None,
     initializer: Initializer = None,
     fit_shape: FitShape = False,
+    clothed: Clothed = "auto",
     views: DepthOptions,
     known: KnownOptions,
     sigma: Sigma = None,
@@ -113,7 +116,7 @@ def align(
     whole picture, or an output other than the results could not be written; 2 for an error; 130 for Ctrl-C.
     """
     views.check()
-    check_used(fit_shape, "--fit-shape", {"--rig": rig})
+    check_used(fit_shape, "--fit-shape", {"--rig": rig, "--clothed": clothed if clothed != "auto" else None})
     _check_together(shape, rig, searched_upright=upright and start is not None, in_picture=views.depth, support=support)
     pictures = views.source(clouds) if views.depth else None
     direction = known_up(up, clouds, camera=views.depth)
@@ -137,7 +140,7 @@ def align(
             options.load(shape_of_side(shape, side)), config,
             pictures.__getitem__ if pictures else lambda k: read_cloud(clouds[k], scale, nan_policy, time, frame),
             clouds, files, bar, fit_shape=fit_shape, rig=(shape, chosen_skin(options.skin)), up=direction,
-            support=support,
+            support=support, clothed=read_clothed(clothed),
         )  # fmt: skip
         run.prepare(start, initializer, side, upright)
         run.known = known.read(run.shape, clouds, pictures, any_side=side == "either")
@@ -196,6 +199,7 @@ class _AlignRun:
     rig: tuple[str, str | int | None]
     up: Direction | None
     support: str
+    clothed: bool | str
     known: Known = field(default_factory=Known)
     initializer: PoseProposer | None = None
     start: Tensor | None = None
@@ -257,8 +261,8 @@ class _AlignRun:
         data = self.read(number)
         result = align(
             self.shape, data, self.start, model_points=None if self.fit_shape else self.skin, fit_shape=self.fit_shape,
-            initializer=self.initializer, support=self.support, config=self.config, on_step=self._show,
-            **self.known.of(number),
+            clothed=self.clothed, initializer=self.initializer, support=self.support, config=self.config,
+            on_step=self._show, **self.known.of(number),
         )  # fmt: skip
         result = remembering(result, self.up)
         path, (picture, pose, ply, rig) = self.files.of(number)

@@ -43,6 +43,12 @@ FitShape = Annotated[
         "of its parts.",
     ),
 ]
+Clothed = Annotated[
+    str,
+    typer.Option(
+        help="Clothes on a body fitted with --fit-shape: auto where the data are likelier with them, yes, or no."
+    ),
+]
 Support = Annotated[
     str, typer.Option(help="A table or a floor that the scanned thing stands on: auto leaves it out, keep keeps it.")
 ]
@@ -51,6 +57,14 @@ Support = Annotated[
 def fitted_shape(shape: ArticulatedShape, wanted: bool) -> ArticulatedShape:
     """Return a shape whose coefficients can be fitted, where that is wanted."""
     return shape.with_bone_coefficients() if wanted and not shape.coefficient_names else shape
+
+
+def read_clothed(text: str) -> bool | str:
+    """Return what `align` takes as ``clothed``."""
+    from torchreg._checks import check_choice
+
+    check_choice(text, "--clothed", ("auto", "yes", "no"))
+    return {"yes": True, "no": False}.get(text, text)
 
 
 def read_schedule(text: str | None) -> SigmaSchedule | None:
@@ -110,8 +124,11 @@ def person_summary(shape: ArticulatedShape, result: AlignResult | TrackResult) -
     """Return the first coefficients that were fitted, with their standard deviations; nothing where none were."""
     if result.coefficients is None or result.coefficient_covariance is None:
         return ""
+    worn = getattr(result, "clothing_offset", None)
+    clothes = [] if worn is None else [f"clothes {1e3 * float(worn.mean()):.0f} mm off the skin on average"]
     rows = zip(
         shape.coefficient_names, result.coefficients.tolist(),
         result.coefficient_covariance.diagonal().sqrt().tolist(), strict=True,
     )  # fmt: skip
-    return ", ".join(f"{name} {value:.2f} +- {std:.2f}" for name, value, std in list(rows)[:6])
+    known = [f"{name} {value:.2f} +- {std:.2f}" for name, value, std in list(rows)[:6]]
+    return ", ".join(known + clothes)

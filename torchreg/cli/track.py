@@ -10,8 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import FitShape, NanPolicy, Scale, fitted_shape, person_summary
-from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
+from torchreg.cli.align_options import (
+    Clothed,
+    FitShape,
+    NanPolicy,
+    Scale,
+    fitted_shape,
+    person_summary,
+    read_clothed,
+)
+from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, check_used, seen_folder
 from torchreg.cli.export import Old, OldWord, check_old
 from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
 from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending, written_to
@@ -91,6 +99,7 @@ def track(
     ] = None,
     initializer: Initializer = None,
     fit_shape: FitShape = False,
+    clothed: Clothed = "auto",
     cameras: StereoOptions,
     views: DepthOptions,
     seen: Seen = None,
@@ -139,8 +148,8 @@ def track(
     With --depth --intrinsics FILE frames are depth pictures, and their free space counts too. Keypoints that a detector
     found, --keypoints, count with any frames.
 
-    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data, or an output other than
-    the result could not be written; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if in any frame the shape was lost, not found or is doubtful, or there were no data, or an output
+    other than the result could not be written; 2 for an error; 130 for Ctrl-C.
     """
     result = with_ending(output, (".safetensors",), add=True)
     from torchreg._checks import check_positive
@@ -152,6 +161,8 @@ def track(
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
     cameras.check(seen, views)
+    check_used(fit_shape, "--fit-shape", {"--clothed": clothed if clothed != "auto" else None})
+    worn = read_clothed(clothed)
     model = options.load(shape)
     if cameras.stereo:
         source: Any = cameras.source(frames, model, views.depth_range, scale)
@@ -169,11 +180,13 @@ def track(
         "--start": None if first is None else first.tolist(), **settings.job(config), "--fps": fps, "--scale": scale,
         "--nan-policy": nan_policy, "frames": list(clouds.names), **given.job(), **cameras.job(source),
         **views.job(source), **({} if initializer is None else {"--initializer": str(initializer)}),
-        **({"--fit-shape": True} if fit_shape else {}),
+        **({"--fit-shape": True, "--clothed": clothed} if fit_shape else {}),
     }  # fmt: skip
     model = fitted_shape(model, fit_shape)
     with claimed(result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
-        tracker = Tracker(model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape)
+        tracker = Tracker(
+            model, first, config=config, locked=given.locked, initializer=network, fit_shape=fit_shape, clothed=worn
+        )  # fmt: skip
         run = TrackRun(
             tracker, clouds, fps, job, files, report=Report(bar, clouds, quiet), save_every=save_every, known=given,
             up=direction, smooth=smooth,

@@ -13,6 +13,7 @@ from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.problem import joint_precision, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
+from torchreg.alignment.shape.clothing import CLOTH, clothed_rig, may_be_clothed
 from torchreg.alignment.shape.person_covariance import plausible_precision, robust_rows
 from torchreg.alignment.shape.shape_fit import fitted_rig, scan_normals, surface_skins
 from torchreg.capture.depth_frame import DepthFrame
@@ -70,14 +71,25 @@ _UPDATE = PersonUpdate()
 
 
 class PersonFilter:
-    """Estimates the shape coefficients of a rig recursively, frame by frame; ``fit_shape`` as of `align`."""
+    """Estimates the shape coefficients of a rig recursively, frame by frame; arguments as of `align`.
+
+    Those of clothes, where a person wears any, follow those of the body.
+    """
 
     def __init__(
-        self, shape: ArticulatedShape, fit_shape: bool | str, seed: int = 0, upright: Direction | None = None
-    ) -> None:
-        self.rig = fitted_rig(shape, fit_shape)
-        self.space = self.rig.coefficient_space()
+        self, shape: ArticulatedShape, fit_shape: bool | str, seed: int = 0, upright: Direction | None = None,
+        clothed: bool | str = False,
+    ) -> None:  # fmt: skip
+        self._clothed = may_be_clothed(shape, clothed, fit_shape)
+        self._bare = fitted_rig(shape, fit_shape)
         self._config = AlignConfig(nan_policy="omit", upright=upright, seed=seed)
+        self.body_count = len(self._bare.coefficient_space())
+        self._wear(self._bare)
+
+    def _wear(self, rig: ArticulatedShape) -> None:
+        """Go on with a rig, bare or with clothes."""
+        self.rig, seed = rig, self._config.seed
+        self.space = self.rig.coefficient_space()
         tree, generator = ShapedTree(self.rig, self.space), torch.Generator().manual_seed(seed)
         self._model, self._skin = surface_skins(
             tree, self.rig.file_surface(), self._config.num_model_points, generator
@@ -88,12 +100,25 @@ class PersonFilter:
 
     def initialize(self, data: Tensor | DepthFrame, start: Tensor | None) -> tuple[Tensor, KnownPerson] | None:
         """Return the pose (num_dofs,) and coefficients of a first frame; None where the shape is not found."""
-        found = align(self.rig, data, start, fit_shape=True, clothed=False, config=self._config)
+        found = align(self._bare, data, start, fit_shape=True, clothed=self._clothed, config=self._config)
         mean, covariance = found.coefficients, found.coefficient_covariance
         shows = found.statuses[0] in (Status.CONVERGED, Status.MAX_STEPS, Status.DOUBTFUL)
         if not shows or mean is None or covariance is None:
             return None
+        if found.clothing_offset is not None:
+            self.of(self.body_count + CLOTH.num_modes)
+            modes: Tensor = self.space.get_buffer("modes").double()
+            worn = torch.linalg.lstsq(modes, found.clothing_offset.to(modes)[:, None]).solution[:, 0]
+            mean = torch.cat([mean, worn.to(mean)])
+            covariance = torch.block_diag(covariance, torch.eye(len(worn)).to(covariance))
         return found.pose, KnownPerson(mean, covariance)
+
+    def of(self, count: int) -> None:
+        """Go on with a rig of a number of coefficients, those of clothes included."""
+        if count > self.body_count and count != len(self.space):
+            # Buffers of clothes must not be inference tensors.
+            with torch.inference_mode(False), torch.no_grad():
+                self._wear(clothed_rig(self._bare))
 
     def fit(
         self, person: KnownPerson, data: Tensor, start: Tensor, motion: Motion | None, viewpoint: Tensor | None = None

@@ -20,6 +20,7 @@ from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_de
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.shape.clothing import CLOTH
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import to_local, to_world
@@ -59,8 +60,8 @@ class Tracker:
 
     Every frame is predicted from those before, registered by annealed EM with the model points seen last and fitted to
     the surface. When the evidence is worse than in the frames before, other poses are tried: around the last ones, then
-    farther off, then everywhere. A shape that is not found keeps its predicted pose, is reported as lost, and is
-    searched again every few frames.
+    farther off, then everywhere. A shape that is lost keeps its predicted pose for ten frames, and is searched again
+    every few frames; then, and before it was first found, it is reported as not found, and has no pose.
 
     Args:
         shape: the articulated shape, in metres.
@@ -73,6 +74,8 @@ class Tracker:
             `align`. The first frame that shows the shape tells the person, as `align` does; that rig is followed then,
             and every frame that is not doubtful narrows what is known of its coefficients. The initial pose is one of
             the mean person.
+        clothed: of a body whose shape is fitted, whether clothes lie between its skin and the data, see `align`: the
+            first frame that shows the person tells. The rig followed has the surface of the clothes then.
 
     Attributes:
         shape: that is followed; with ``fit_shape`` that of the person, once a frame showed any.
@@ -94,13 +97,16 @@ class Tracker:
         locked: Sequence[str] | Tensor = (),
         initializer: PoseProposer | HoldsProposer | None = None,
         fit_shape: bool | str = False,
+        clothed: bool | str = "auto",
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
         if fit_shape is not False and not (model_points is None and initializer is None and len(locked) == 0):
             raise InputError("fit_shape goes without model_points, locked and initializer; leave them out")
         self._person = None if fit_shape is False else PersonFilter(
-            shape, fit_shape, self.config.seed, self.config.upright
+            shape, fit_shape, self.config.seed, self.config.upright, clothed
         )  # fmt: skip
+        if fit_shape is False and clothed is True:
+            raise InputError("clothed=True needs fit_shape=True")
         self._followed: Tensor | None = None
         if model_points is not None:
             model_points = check_skin(shape, model_points)
@@ -136,13 +142,16 @@ class Tracker:
                 f"state must be that of a shape with {dofs} degrees of freedom and {parts} parts, got poses of shape "
                 f"{tuple(state.pose.shape)} and weights of shape {tuple(state.weights.shape)}"
             )
-        count = 0 if self._person is None else len(self._person.space)
-        if state.person is not None and state.person.shape != (count,):
+        count = 0 if self._person is None else self._person.body_count
+        counts = (count, count + CLOTH.num_modes) if count else (0,)
+        if state.person is not None and len(state.person) not in counts:
             raise InputError(
                 f"state must be that of a tracker with {count} coefficients, got {tuple(state.person.shape)} of them; "
                 f"fit_shape must be the same"
             )
         self._state = state
+        if self._person is not None and state.person is not None:
+            self._person.of(len(state.person))
         self._follow(state.person)
 
     def step(
@@ -167,7 +176,7 @@ class Tracker:
 
         Returns:
             The frame's result. Its pose rests on data unless its status is NO_DATA, LOST, DEGENERATE or
-            OTHER_UNITS.
+            OTHER_UNITS. Where the status is NOT_FOUND there is none: the shape did not come yet, or has left.
 
         Raises:
             InputError: if the points are not (M, 3), or not finite under ``nan_policy="raise"``, or the time is not
@@ -210,9 +219,7 @@ class Tracker:
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
             self._state = normal_copy(state)
-            found = normal_copy(replace(
-                result, coefficients=state.coefficients, coefficient_covariance=state.coefficient_covariance
-            ))  # fmt: skip
+            found = normal_copy(self._with_coefficients(result))
         self._follow_closer()
         return to_world(found, state.origin)
 
@@ -278,6 +285,14 @@ class Tracker:
             state, pose=pose, person=known.coefficients, coefficients=known.coefficients,
             coefficient_covariance=known.covariance,
         )  # fmt: skip
+
+    def _with_coefficients(self, result: FrameResult) -> FrameResult:
+        """Return a frame's result with what is known of the body's coefficients."""
+        mean, covariance = self._state.coefficients, self._state.coefficient_covariance
+        if self._person is None or mean is None or covariance is None:
+            return result
+        count = self._person.body_count
+        return replace(result, coefficients=mean[:count], coefficient_covariance=covariance[:count, :count])
 
     def _follow(self, coefficients: Tensor | None) -> None:
         """Go on with the rig of a person with coefficients (K,), where there is one and it is another."""
