@@ -155,6 +155,22 @@ def draw_spine(folder, smoke):
     return f"{spine.num_tips} tips; {same} of {len(meshes)} frames have the tree by themselves"
 
 
+def draw_rig(folder, smoke):
+    """A starfish meshed anew in every frame, beside its rig, by bones."""
+    meshes = list(creature_sequence(num_frames=2 if smoke else 6, resolution=40 if smoke else 96, seed=1).meshes)
+    align = replace(tr.RegisterConfig().align, num_samples=300)
+    config = tr.RigConfig(num_points=500, rounds=4, register=tr.RegisterConfig(align=align, num_samples=500))
+    rig = tr.rig_sequence(meshes, config=config if smoke else None)
+    colors, faces, moved = weight_colors(rig.weights).clamp(0, 1), rig.shape.file_skin().faces, rig.vertices()
+    panels = []
+    for frame in (0, len(meshes) - 1):
+        mesh = MovingMesh("mesh", meshes[frame].vertices, meshes[frame].faces, TARGET)
+        posed = MovingMesh("rig", moved[frame].float(), faces, colors.float())
+        panels += [(f"frame {frame}", Scene("", (mesh,)), 0), ("rig, by bones", Scene("", (posed,)), 0)]
+    draw_row(folder / "rig.png", panels)
+    return f"{len(rig.joints)} bones; {float(rig.errors.max()):.2%} of the diagonal in the worst frame"
+
+
 def draw_bending(folder, smoke):
     """The skin at a joint, sliding and near rigid; figure 2 of the first paper."""
     bending_picture(folder / "bending.png", (2.0,) if smoke else (2.0, 10.0))
@@ -191,11 +207,12 @@ def main(arguments=None):
     parser.add_argument("--output", type=Path, default=HERE / "images" / "gallery", help="folder of the pictures")
     parser.add_argument("--data", type=Path, help="folder with captured data; without it they are skipped")
     parser.add_argument("--smoke", action="store_true", help="small and coarse, in seconds")
-    parser.add_argument("--only", nargs="*", help="names of pictures: bending, alignment, registration, spine")
+    parser.add_argument("--only", nargs="*", help="names of pictures: bending, alignment, registration, spine, rig")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     jobs = {
         "bending": draw_bending, "alignment": draw_alignment, "registration": draw_registration, "spine": draw_spine,
+        "rig": draw_rig,
     }  # fmt: skip
     for name in options.only or jobs:
         began = time.perf_counter()

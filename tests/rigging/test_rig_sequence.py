@@ -107,6 +107,12 @@ def test_what_cannot_be_rigged_is_refused(frames, change, options, message):
         tr.rig_sequence(change(frames), **options)
 
 
+@pytest.mark.parametrize("frame", [None, "frame.ply", torch.zeros(200, 2)])
+def test_frames_of_another_type_are_named(frames, frame):
+    with pytest.raises(tr.errors.InputTypeError, match=r"meshes\[1\] must be a mesh, a scan or points"):
+        tr.rig_sequence([frames[0], frame])
+
+
 @pytest.mark.parametrize("options", [{"num_bones": 0}, {"width": (0.0, 1.0)}, {"stay": -1.0}])
 def test_settings_are_checked(options):
     with pytest.raises(tr.errors.InputError):
@@ -114,7 +120,8 @@ def test_settings_are_checked(options):
 
 
 def test_a_frame_may_be_a_cloud(arm, frames):
-    cloud = tr.RangeScan(anew(tr.TriangleMesh(posed(arm, 0.3), arm.mesh.faces), 7).vertices)
+    cloud = anew(tr.TriangleMesh(posed(arm, 0.3), arm.mesh.faces), 7).vertices
+    cloud[0] = torch.nan
     found = tr.rig_sequence([frames[0], cloud], config=CONFIG)
     assert found.template == 0
     assert float(found.errors[1]) < 0.015

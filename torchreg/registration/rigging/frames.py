@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count
-from torchreg.errors import InputError
+from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.loaded import as_points, as_scan
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
@@ -49,7 +49,7 @@ def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) 
         check_count(template, "template", 0)
         if template >= len(meshes):
             raise InputError(f"template must be below the number of frames {len(meshes)}, got {template}")
-    points = [_finite(as_points(mesh)) for mesh in meshes]
+    points = [_finite(mesh, f"meshes[{number}]") for number, mesh in enumerate(meshes)]
     sizes = torch.stack([_radius(each) for each in points])
     median = sizes[sizes > 0].median() if bool((sizes > 0).any()) else sizes.new_tensor(0.0)
     notes: dict[int, str] = {}
@@ -66,7 +66,9 @@ def usable_frames(meshes: Sequence[Any], template: int | None, num_points: int) 
         raise InputError(f"meshes must hold two frames of one thing at least; {'; '.join(notes.values())}")
     if template in notes:
         raise InputError(f"template must be a frame that shows the thing; {notes[template]}")
-    scans = [as_scan(meshes[number], f"meshes[{number}]").to(device="cpu", dtype=torch.float64) for number in kept]
+    clouds = {number: RangeScan(points[number]) for number in kept if isinstance(meshes[number], Tensor)}
+    scans = [as_scan(clouds.get(number, meshes[number]), f"meshes[{number}]") for number in kept]
+    scans = [scan.to(device="cpu", dtype=torch.float64) for scan in scans]
     chosen = _freest(scans) if template is None else kept.index(template)
     faces = scans[chosen].faces
     if faces is None:
@@ -85,8 +87,11 @@ def _freest(scans: Sequence[RangeScan]) -> int:
     return int(areas.argmax())
 
 
-def _finite(points: Tensor) -> Tensor:
-    points = torch.as_tensor(points).detach().double().reshape(-1, 3)
+def _finite(value: Any, name: str) -> Tensor:
+    points = as_points(value)
+    if not isinstance(points, Tensor) or points.shape[-1:] != (3,):
+        raise InputTypeError(f"{name} must be a mesh, a scan or points (N, 3), got {type(value).__name__}")
+    points = points.detach().double().reshape(-1, 3)
     return points[points.isfinite().all(-1)]
 
 
