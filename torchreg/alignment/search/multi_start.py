@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -63,10 +64,13 @@ class Candidates:
     @classmethod
     def fitted(cls, problem: AlignProblem, poses: Tensor) -> Candidates:
         """Return candidates (B, K, num_dofs) fitted to all data down to their noise."""
-        wide = problem.repeated(poses.shape[1])
-        steps, widths = SURFACE_FIT.search_steps, SURFACE_FIT.widths[-1:]
-        fitted = fit_surface(wide, poses.flatten(0, 1), steps=steps, widths=widths).pose
-        return cls.ranked(problem, fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(poses.shape[:2]))
+
+        def fit(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
+            steps, widths = SURFACE_FIT.search_steps, SURFACE_FIT.widths[-1:]
+            fitted = fit_surface(part, pose, steps=steps, widths=widths).pose
+            return fitted, alignment_cost(part, fitted)
+
+        return cls.ranked(problem, *_few_at_a_time(fit, problem, poses))
 
     def apart(self, same: float) -> Tensor:
         """Return which candidates differ (B, K, K): by more than a share of the size, on average over their points."""
@@ -94,12 +98,25 @@ class Candidates:
 
 def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, Tensor]:
     """Return poses (B, K, num_dofs) after the steps of a plan on the surface, and their scores (B, K)."""
-    wide, pose = problem.repeated(poses.shape[1]), poses.flatten(0, 1)
-    noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
-    for width in plan.widths:
-        pose = surface_steps(wide, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
-    poses = pose.reshape(poses.shape)
-    return poses, score_candidates(problem, poses, plan.score_width)
+
+    def descent(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
+        noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
+        for width in plan.widths:
+            pose = surface_steps(part, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
+        return pose, score_candidates(part, pose.unsqueeze(1), plan.score_width)[:, 0]
+
+    return _few_at_a_time(descent, problem, poses)
+
+
+def _few_at_a_time(
+    evaluate: Callable[[AlignProblem, Tensor], tuple[Tensor, Tensor]], problem: AlignProblem, poses: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return poses (B, K, num_dofs) and costs (B, K), evaluated for few candidates at a time."""
+    # The wrenches of all parts on all data are the largest table of a Jacobian.
+    pose, wrenches = poses.flatten(0, 1), 6 * problem.data.shape[1] * problem.skin.shape.num_parts
+    rows = rows_in_memory(len(pose), wrenches, pose.device)
+    found, costs = zip(*(evaluate(problem.rows(row // poses.shape[1]), pose[row]) for row in rows), strict=True)
+    return torch.cat(found).reshape(poses.shape), torch.cat(costs).reshape(poses.shape[:2])
 
 
 def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
