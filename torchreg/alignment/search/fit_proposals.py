@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.fit.problem import AlignProblem, joint_precision
-from torchreg.alignment.search.multi_start import Candidates, Plan, take_rows
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, take_rows
 from torchreg.alignment.search.pose_proposer import Proposals
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.shapes.pose_algebra import BASE_DOFS
@@ -27,12 +27,11 @@ class _Fit:
     reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
     joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
     matched_steps: int = 2  # in each round
-    same: float = 0.05  # fitted poses whose points differ by less are duplicates
 
 
 _FIT = _Fit()
 # From what a proposal errs by to a searched pose's width.
-_PLAN = Plan(widths=(0.05, 0.03, 0.02), steps=2, score_width=0.022)
+_PLAN = Plan(widths=(0.05, 0.03, 0.02), steps=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +53,7 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
     fitted = Candidates.descended(coarse, pool, _PLAN)
     share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
     best = fitted.poses[:, 0]
-    return BestProposal(
-        best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead(_FIT.same) * share
-    )
+    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead() * share)
 
 
 @torch.no_grad()
@@ -68,7 +65,7 @@ def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> T
     wide = problem.repeated(number)
     wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
     matched = matched_pose(wide, proposals).reshape(poses.shape)
-    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(_FIT.same, count)
+    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(SEARCH_BUDGET.same, count)
     return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
 
 

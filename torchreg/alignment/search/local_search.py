@@ -49,7 +49,6 @@ class _Around:
 
     fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
-    same: float = 0.045  # share of the size: rigs whose points differ by less are duplicates
     num_refined: int = 3  # candidates that are refined thoroughly, at most
 
 
@@ -110,7 +109,7 @@ def _aligned_around(
     """Return the best poses of rigs whose candidates around the starts and the descents are aligned whole."""
     limbs, count = find_limbs(problem.skin.shape)[0], max(1, candidates // 4)
     pool = [_scatter(problem, limbs, center, count, generator) for center in (start, descended)]
-    aligned = align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, _AROUND.same, generator)
+    aligned = align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, generator)
     return Candidates.fitted(problem, aligned).poses[:, 0]
 
 

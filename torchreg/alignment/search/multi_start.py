@@ -24,6 +24,8 @@ class SearchBudget:
     num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
     num_model_points: int = 120  # that cover the shape
     num_compared: int = 60  # model points by which candidates are compared
+    same: float = 0.05  # fitted poses whose points differ by less are one
+    alike: float = 0.045  # the same of rough poses
     max_ranked: int = 400  # best candidates, of which different ones are taken
     noise: float = 0.01  # standard deviation of the data for the weight of the prior
     cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
@@ -39,7 +41,7 @@ class Plan:
 
     widths: tuple[float, ...]
     steps: int
-    score_width: float
+    score_width: float = 0.022
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +78,9 @@ class Candidates:
         """Return which candidates differ (B, K, K): by more than a share of the size, on average over their points."""
         return mean_distances(self.problem, self.poses) > same * self.problem.size
 
-    def lead(self, same: float) -> Tensor:
+    def lead(self) -> Tensor:
         """Return the cost (B,) by which the best of different candidates is worse than the first, or infinity."""
-        return torch.where(self.apart(same)[:, 0], self.costs, torch.inf).amin(1) - self.costs[:, 0]
+        return torch.where(self.apart(SEARCH_BUDGET.same)[:, 0], self.costs, torch.inf).amin(1) - self.costs[:, 0]
 
     def distinct(self, same: float, count: int | None = None) -> Candidates:
         """Return the best ``count`` that differ; then duplicates of them."""
@@ -127,7 +129,7 @@ def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tens
     return scores + problem.factor_score(poses, width)
 
 
-def align_rows(problem: AlignProblem, poses: Tensor, count: int, same: float, generator: torch.Generator) -> Tensor:
+def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return the best ``count`` of candidates (B, K, num_dofs) after an alignment of all their joints to few data.
 
     The limbs of a skinned rig are not placed one after another: the solids that stand for its parts are too rough for
@@ -143,7 +145,7 @@ def align_rows(problem: AlignProblem, poses: Tensor, count: int, same: float, ge
         pose = fit_surface(part, pose, steps=settings.surface_steps).pose
         costs = alignment_cost(part, pose).unflatten(0, (-1, candidates))
         ranked = Candidates.ranked(drawn.rows(rows), pose.unflatten(0, (-1, candidates)), costs)
-        found.append(ranked.distinct(same, count).poses)
+        found.append(ranked.distinct(SEARCH_BUDGET.alike, count).poses)
     return torch.cat(found)
 
 
