@@ -2,7 +2,10 @@
 
 500 model points, 1,000 data points (a third of them outliers), 27 degrees of freedom, five sigma steps, then the
 surface fit. Starts are 5 degrees off per joint, as in tracking; the cost of a search, which far starts trigger, is
-shown beside it. On a GPU: ``--device cuda``.
+shown beside it. On a CPU seconds are those of the process, so that other programs hardly count. On a GPU: ``--device
+cuda``. Hands without a start, alone and in a batch, of 600 points: ``--without-start``; two trees side by side:
+
+    for tree in BEFORE AFTER; do PYTHONPATH=$tree OMP_NUM_THREADS=1 python benchmarks/speed.py --without-start; done
 """
 
 from __future__ import annotations
@@ -20,35 +23,38 @@ from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_sk
 BAR_PER_SECOND = 30.0
 
 
-def make_problems(hand: tr.Hand, count: int, start_deg: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return ``count`` clouds (B, 1000, 3) and starts (B, 27) that are ``start_deg`` off per joint."""
+def make_problems(
+    hand: tr.Hand, count: int, start_deg: float, seed: int = 0, points: int = 1000
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return ``count`` clouds (B, points, 3) and starts (B, 27) that are ``start_deg`` off per joint."""
     generator = torch.Generator().manual_seed(seed)
     skin = surface_skin(hand)
     clouds, starts = [], []
     for _ in range(count):
         pose = random_hand_pose(hand, generator)
         cloud = make_hand_cloud(
-            hand, pose, num_points=667, outlier_ratio=0.333, camera=torch.zeros(3), skin=skin, generator=generator
-        )
+            hand, pose, num_points=round(2 * points / 3), outlier_ratio=0.333, camera=torch.zeros(3), skin=skin,
+            generator=generator,
+        )  # fmt: skip
         signs = 2 * torch.randint(0, 2, (21,), generator=generator) - 1
         start = pose.clone()
         start[6:] += signs * torch.deg2rad(torch.tensor(start_deg))
-        clouds.append(cloud.points[torch.arange(1000) % len(cloud.points)])
+        clouds.append(cloud.points[torch.arange(points) % len(cloud.points)])
         starts.append(hand.clamp(start))
     return torch.stack(clouds), torch.stack(starts)
 
 
 def best_time(run: Callable[[], object], repeats: int) -> float:
-    """Return the shortest of several wall times, seconds: the one least disturbed by other programs."""
-    times = []
+    """Return the shortest of several times, seconds: the one least disturbed by other programs."""
+    clock, times = time.perf_counter if torch.cuda.is_available() else time.process_time, []
     for _ in range(repeats):
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        begin = time.perf_counter()
+        begin = clock()
         run()
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        times.append(time.perf_counter() - begin)
+        times.append(clock() - begin)
     return min(times)
 
 
@@ -71,6 +77,17 @@ def rate_batched(hand: tr.Hand, clouds: torch.Tensor, starts: torch.Tensor, repe
     return len(clouds) / best_time(lambda: tr.align(hand, clouds, starts, model_points=skin, config=config), repeats)
 
 
+def print_without_start(hand: tr.Hand, clouds: torch.Tensor, repeats: int) -> None:
+    """Print alignments per second without a start, one call each and all in one call."""
+    skin, few = tr.sample_skin(hand, 500), clouds[: max(len(clouds) // 4, 1)]
+    tr.align(hand, clouds[:1], model_points=skin)
+    alone = len(few) / best_time(lambda: [tr.align(hand, cloud, model_points=skin) for cloud in few], repeats)
+    batch = len(clouds) / best_time(lambda: tr.align(hand, clouds, model_points=skin), repeats)
+    print(
+        f"without a start, {clouds.shape[1]} points: alone {alone:.2f}, batch of {len(clouds)} {batch:.2f} per second"
+    )
+
+
 def print_profile(hand: tr.Hand, clouds: torch.Tensor, starts: torch.Tensor, config: tr.AlignConfig) -> None:
     """Print which operations the time of single alignments goes to."""
     skin = tr.sample_skin(hand, 500)
@@ -90,10 +107,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--smoke", action="store_true", help="a seconds-long version")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--without-start", action="store_true", help="hands of 600 points without a start alone")
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
     hand = tr.Hand()
     count, repeats = (1, 1) if arguments.smoke else (32, 5)
+    if arguments.without_start:
+        print_without_start(hand, make_problems(hand, count, 5.0, points=600)[0], min(repeats, 2))
+        return
     clouds, starts = make_problems(hand, count, 5.0)
     hand = hand.to(arguments.device)
     clouds, starts = clouds.to(arguments.device), starts.to(arguments.device)

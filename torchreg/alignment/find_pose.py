@@ -27,7 +27,7 @@ from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.search.in_picture import surest_crop
 from torchreg.alignment.search.landmark_fit import KeypointRows, find_keypoints
-from torchreg.alignment.search.multi_start import Candidates, align_rows
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, align_rows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.rough_poses import PoseSource, bent_pose, register_rigidly
@@ -44,11 +44,9 @@ from torchreg.shapes.surface import SkinSurface
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Numbers of the candidates; lengths are shares of the model's size."""
+    """Numbers of the candidates."""
 
     typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
-    same: float = 0.05  # found poses whose points differ by less are duplicates
-    alike: float = 0.045  # the same of rough poses
     fit_steps: int = 3  # at each width of the coarse fit
     proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
 
@@ -193,9 +191,9 @@ def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> Fo
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=4)
         with one_thread():
             found = _find(problem, seen.frames, task.source.with_known(known), config)
-        lead = found.lead(_CANDIDATES.same)
+        lead = found.lead()
         confidence = torch.where(degenerate, 0.0, pose_confidence(problem, found.poses[:, 0], lead))
-        best = found.distinct(_CANDIDATES.same, num_starts)
+        best = found.distinct(SEARCH_BUDGET.same, num_starts)
         poses = shifted(best.poses, origin.unsqueeze(1))
         starts = PoseStarts(poses=poses, costs=best.costs, confidence=confidence)
         rivals = torch.where(_are_rivals(best).unsqueeze(-1), poses, torch.nan)[:, 1:]
@@ -226,7 +224,7 @@ def _find(
         return _search_with_retries(problem, source, config, proposed)
     found = Candidates.fitted(problem, proposed)
     uncropped = without_cut(problem, found.poses[:, 0], frames)
-    sure = explains(uncropped, found.poses[:, 0], found.lead(_CANDIDATES.same)) >= CALIBRATION.doubtful
+    sure = explains(uncropped, found.poses[:, 0], found.lead()) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     count = min(config.num_searched, config.num_placed)
@@ -262,10 +260,10 @@ def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, 
     rough = source.rough(search.problem, generator)
     ranked = Candidates.ranked(search.problem, *register_rigidly(search.problem, rough, generator))
     if isinstance(problem.surface, SkinSurface):
-        rough = torch.cat([proposed, ranked.distinct(_CANDIDATES.alike, config.num_placed).poses], dim=1)
-        aligned = align_rows(problem, rough, config.num_searched, _CANDIDATES.alike, generator)
+        rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.alike, config.num_placed).poses], dim=1)
+        aligned = align_rows(problem, rough, config.num_searched, generator)
         return Candidates.fitted(problem, aligned)
-    rough = ranked.distinct(_CANDIDATES.alike, config.num_candidates).poses
+    rough = ranked.distinct(SEARCH_BUDGET.alike, config.num_candidates).poses
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
     pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
@@ -274,7 +272,7 @@ def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, 
 
 def _are_rivals(best: Candidates) -> Tensor:
     """Return which candidates (B, S) after the first differ from all before them and explain nearly as much."""
-    apart = best.apart(_CANDIDATES.same)
+    apart = best.apart(SEARCH_BUDGET.same)
     is_later = torch.ones_like(apart[0]).triu()
     behind = best.costs - best.costs[:, :1]
     margin = rival_margin(best.problem.valid.sum(-1)).unsqueeze(-1)

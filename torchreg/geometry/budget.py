@@ -10,7 +10,7 @@ class Budget:
     """Sizes held at a time, and largest sizes of what is made."""
 
     # Entries of a table of pairs that is worked on in place: what a CPU's caches hold.
-    table_entries: int = 2_000_000
+    table_entries: int = 1_000_000
     # Entries of a table of distances, which is written once and searched for its minima.
     distance_entries: int = 16_000_000
     # Pixels covered by the triangles that are rasterized together; about 100 MB.

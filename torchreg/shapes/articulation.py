@@ -267,9 +267,15 @@ class Articulation(PosedTree):
         return fused.masked_fill(gone.all(-1), torch.inf)
 
     def distance_jacobian(
-        self, points: Tensor, pose: Tensor, *, chart: str = "pose", parts: Sequence[int] | None = None
+        self,
+        points: Tensor,
+        pose: Tensor,
+        *,
+        chart: str = "pose",
+        parts: Sequence[int] | None = None,
+        dofs: Sequence[int] | slice = slice(None),
     ) -> tuple[Tensor, Tensor]:
-        """Return the fused distances (..., N) and their analytic Jacobian (..., N, num_dofs).
+        """Return the fused distances (..., N) and their analytic Jacobian (..., N, num_dofs), or its columns ``dofs``.
 
         The points (..., N, 3) are fixed in the world; ``chart`` as in `part_twists`, ``parts`` as in `distance`.
         """
@@ -285,7 +291,8 @@ class Articulation(PosedTree):
         fx, fy, fz = (plane * shares.mT for plane in gradient)
         moment = (_minor(y, fz, z, fy), _minor(z, fx, x, fz), _minor(x, fy, y, fx))
         wrench = torch.cat([fx, fy, fz, *moment], dim=-2)
-        return fused, (self._solid_twists(linear, angular, solids, moves).mT @ wrench).mT
+        twists = self._solid_twists(linear, angular, solids, moves)[..., dofs]
+        return fused, (twists.mT @ wrench).mT
 
     def _solid_twists(self, linear: Tensor, angular: Tensor, solids: Tensor, moves: Tensor) -> Tensor:
         """Return the negative twists (..., 6 P, num_dofs) of solids in their frames, a row per component and part."""

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.fit.problem import AlignProblem, joint_precision
-from torchreg.alignment.search.multi_start import Candidates, Plan
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, take_rows
 from torchreg.alignment.search.pose_proposer import Proposals
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.shapes.pose_algebra import BASE_DOFS
@@ -26,12 +27,11 @@ class _Fit:
     reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
     joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
     matched_steps: int = 2  # in each round
-    same: float = 0.05  # fitted poses whose points differ by less are duplicates
 
 
 _FIT = _Fit()
 # From what a proposal errs by to a searched pose's width.
-_PLAN = Plan(widths=(0.05, 0.03, 0.02), steps=2, score_width=0.022)
+_PLAN = Plan(widths=(0.05, 0.03, 0.02), steps=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,7 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
     fitted = Candidates.descended(coarse, pool, _PLAN)
     share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
     best = fitted.poses[:, 0]
-    return BestProposal(
-        best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead(_FIT.same) * share
-    )
+    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead() * share)
 
 
 @torch.no_grad()
@@ -66,8 +64,8 @@ def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> T
     number = poses.shape[1]
     wide = problem.repeated(number)
     wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
-    matched = matched_pose(wide, proposals.repeated(number)).reshape(poses.shape)
-    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(_FIT.same, count)
+    matched = matched_pose(wide, proposals).reshape(poses.shape)
+    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(SEARCH_BUDGET.same, count)
     return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
 
 
@@ -83,17 +81,28 @@ def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignPro
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
-    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest."""
+    """Return poses (B K, num_dofs) after an EM that matches data to model points near their places at rest.
+
+    Of B clouds the problem has K rows each. Pairs of a datum and a model point that rounding cannot tell from none are
+    left out: few are near each other.
+    """
     skin, sigma, pose = problem.skin, _FIT.sigma * problem.size, problem.prior.mean
     near = torch.cdist(proposals.surface, skin.points).square()
-    told = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1) * proposals.inlier.unsqueeze(-1)
+    share = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1)
+    share, index = share.topk(int((share > torch.finfo(share.dtype).eps).sum(-1).max()), sorted=False)
+    told, index, points = (
+        each.repeat_interleave(len(pose) // len(near), 0)
+        for each in (share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2))
+    )
     for width in (None, *_FIT.reach):
         weight = told
         if width is not None:
-            far = torch.cdist(proposals.points, skin(pose)) / (width * problem.size)
-            weight = told * (-0.5 * far.square()).exp()
-        total = weight.sum(1)
-        targets = weight.mT @ proposals.points / total.clamp_min(1e-9).unsqueeze(-1)
+            far = (points - take_rows(skin(pose), index).unflatten(1, told.shape[1:])).square().sum(-1)
+            weight = told * (far * (-0.5 / (width * problem.size) ** 2)).exp()
+        each = (weight.unsqueeze(-1) * pad(points, (0, 1), value=1.0)).flatten(1, 2)
+        sums = each.new_zeros(len(pose), len(skin), 4).scatter_add(1, index.unsqueeze(-1).expand_as(each), each)
+        total = sums[..., 3]
+        targets = sums[..., :3] / total.clamp_min(1e-9).unsqueeze(-1)
         matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
         objective = registration_objective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
         for _ in range(_FIT.matched_steps):

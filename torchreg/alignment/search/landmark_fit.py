@@ -16,7 +16,7 @@ from torchreg.alignment.fit.objectives import Objective
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_problem
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
-from torchreg.alignment.search.multi_start import Candidates
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates
 from torchreg.alignment.search.rough_poses import bent_pose, typical_poses
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_log, spread_rotations
@@ -38,7 +38,6 @@ class _Search:
     refined: int = 24  # best candidates, of which each is refined
     refine_steps: int = 15
     joint_std: float = 0.4  # of a weak prior about a typical pose, radians
-    same: float = 0.05  # poses whose points differ by less are one
     least: int = 4  # keypoints that agree with a pose, at least: three hold a rigid body, and leave two ways
 
 
@@ -106,8 +105,8 @@ class KeypointRows:
     def finished(self) -> KeypointRows:
         """Return the rows, best first, duplicates of better ones last."""
         ranked = Candidates.ranked(self.problem, self.poses[None], self.costs[None])
-        first = ranked.distinct(_SEARCH.same)
-        return replace(self, poses=first.poses[0], costs=first.costs[0], lead=ranked.lead(_SEARCH.same)[0])
+        first = ranked.distinct(SEARCH_BUDGET.same)
+        return replace(self, poses=first.poses[0], costs=first.costs[0], lead=ranked.lead()[0])
 
     def judged(self) -> AlignResult:
         """Return the alignment of the first row; it has no data."""

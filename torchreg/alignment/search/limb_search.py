@@ -258,8 +258,8 @@ class _Search:
         else:
             relative = self.limbs.transforms_on_parent(body, poses, self.shape.part_transforms(poses))
         placed = (beam.frames[:, :, None, None] @ relative).flatten(1, 2)
-        losses = self._part_losses(near, placed, list(body.parts), self.width)
-        losses = torch.minimum(losses, beam.losses.repeat_interleave(values.shape[1], dim=1))
+        losses = self._part_losses(near, placed, list(body.parts), self.width).unflatten(1, (count, -1))
+        losses = torch.minimum(losses, beam.losses.unsqueeze(2)).flatten(1, 2)
         return _Beam(poses.flatten(1, 2), losses, placed[:, :, 0])
 
     def _pruned(self, beam: _Beam, strata: int, keep: int) -> _Beam:
@@ -285,9 +285,8 @@ class _Search:
         lower, upper = (limit.expand_as(poses[:, 0])[:, None, dofs] for limit in (problem.lower, problem.upper))
         for width in self.effort.refine_widths:
             distance, jacobian = self.shape.distance_jacobian(
-                problem.data.unsqueeze(1), poses, chart="tangent", parts=self.limbs.parts[limb]
+                problem.data.unsqueeze(1), poses, chart="tangent", parts=self.limbs.parts[limb], dofs=dofs
             )
-            jacobian = jacobian[..., dofs]
             near = welsch_weight((distance / (width * problem.size)).square())
             weighted = jacobian * (weights * near).unsqueeze(-1)
             values = poses[..., dofs]

@@ -49,10 +49,7 @@ class _Around:
 
     fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
-    same: float = 0.045  # share of the size: rigs whose points differ by less are duplicates
     num_refined: int = 3  # candidates that are refined thoroughly, at most
-    data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
-    entries: int = 4_000_000  # of a table in memory
 
 
 _TRUST = _Trust()
@@ -82,37 +79,13 @@ def _motion(start: Tensor, pose: Tensor) -> Tensor:
 def explore(
     problem: AlignProblem, start: Tensor, descended: Tensor, *, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
-    """Return the best poses found around the starts; the problems of a batch are searched together.
+    """Return the best poses (B, num_dofs) found around starts; the problems of a batch are searched together.
 
-    Limbs are placed anew from the descended pose. Where that shows that it was in a wrong minimum, candidates are
-    scattered around the start and the best pose so far, and go through `PoseSearch` in one batch. Of a skinned rig half
-    as many are scattered at once, and all of their joints aligned, see `align_rows`.
-
-    Args:
-        problem: the batch.
-        start: (B, num_dofs).
-        descended: (B, num_dofs) result of a single descent from each start.
-        candidates: per problem.
-        rounds: of the thorough search, at most.
-        generator: of the scatter and of the subset of the data.
-
-    Returns:
-        (B, num_dofs).
+    Limbs are placed anew from the poses ``descended`` from the starts. Where that shows that one was in a wrong
+    minimum, ``candidates`` per problem are scattered around the start and the best pose so far, and go through
+    `PoseSearch`, the last stage at most ``rounds`` times. Of a skinned rig half as many are scattered at once, and all
+    of their joints aligned, see `align_rows`. The draws for a problem do not depend on the others.
     """
-    per_problem = candidates * _AROUND.data_per_candidate * problem.skin.shape.num_parts
-    rows = torch.arange(len(start), device=start.device).split(max(1, _AROUND.entries // per_problem))
-    state, found = generator.get_state(), []
-    for row in rows:
-        # The draws for a problem do not depend on the others.
-        generator.set_state(state)
-        found.append(_explore(problem.rows(row), start[row], descended[row], candidates, rounds, generator))
-    return torch.cat(found)
-
-
-def _explore(
-    problem: AlignProblem, start: Tensor, descended: Tensor, candidates: int, rounds: int, generator: torch.Generator
-) -> Tensor:
-    """Return the best poses of a thorough search from each descent and, where needed, of one from all around."""
     if isinstance(problem.surface, SkinSurface):
         return _aligned_around(problem, start, descended, candidates, generator)
     search = PoseSearch(problem, generator)
@@ -136,7 +109,7 @@ def _aligned_around(
     """Return the best poses of rigs whose candidates around the starts and the descents are aligned whole."""
     limbs, count = find_limbs(problem.skin.shape)[0], max(1, candidates // 4)
     pool = [_scatter(problem, limbs, center, count, generator) for center in (start, descended)]
-    aligned = align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, _AROUND.same, generator)
+    aligned = align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, generator)
     return Candidates.fitted(problem, aligned).poses[:, 0]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,6 +24,8 @@ class SearchBudget:
     num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
     num_model_points: int = 120  # that cover the shape
     num_compared: int = 60  # model points by which candidates are compared
+    same: float = 0.05  # fitted poses whose points differ by less are one
+    alike: float = 0.045  # the same of rough poses
     max_ranked: int = 400  # best candidates, of which different ones are taken
     noise: float = 0.01  # standard deviation of the data for the weight of the prior
     cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
@@ -38,7 +41,7 @@ class Plan:
 
     widths: tuple[float, ...]
     steps: int
-    score_width: float
+    score_width: float = 0.022
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +66,21 @@ class Candidates:
     @classmethod
     def fitted(cls, problem: AlignProblem, poses: Tensor) -> Candidates:
         """Return candidates (B, K, num_dofs) fitted to all data down to their noise."""
-        wide = problem.repeated(poses.shape[1])
-        steps, widths = SURFACE_FIT.search_steps, SURFACE_FIT.widths[-1:]
-        fitted = fit_surface(wide, poses.flatten(0, 1), steps=steps, widths=widths).pose
-        return cls.ranked(problem, fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(poses.shape[:2]))
+
+        def fit(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
+            steps, widths = SURFACE_FIT.search_steps, SURFACE_FIT.widths[-1:]
+            fitted = fit_surface(part, pose, steps=steps, widths=widths).pose
+            return fitted, alignment_cost(part, fitted)
+
+        return cls.ranked(problem, *_few_at_a_time(fit, problem, poses))
 
     def apart(self, same: float) -> Tensor:
         """Return which candidates differ (B, K, K): by more than a share of the size, on average over their points."""
         return mean_distances(self.problem, self.poses) > same * self.problem.size
 
-    def lead(self, same: float) -> Tensor:
+    def lead(self) -> Tensor:
         """Return the cost (B,) by which the best of different candidates is worse than the first, or infinity."""
-        return torch.where(self.apart(same)[:, 0], self.costs, torch.inf).amin(1) - self.costs[:, 0]
+        return torch.where(self.apart(SEARCH_BUDGET.same)[:, 0], self.costs, torch.inf).amin(1) - self.costs[:, 0]
 
     def distinct(self, same: float, count: int | None = None) -> Candidates:
         """Return the best ``count`` that differ; then duplicates of them."""
@@ -94,12 +100,25 @@ class Candidates:
 
 def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, Tensor]:
     """Return poses (B, K, num_dofs) after the steps of a plan on the surface, and their scores (B, K)."""
-    wide, pose = problem.repeated(poses.shape[1]), poses.flatten(0, 1)
-    noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
-    for width in plan.widths:
-        pose = surface_steps(wide, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
-    poses = pose.reshape(poses.shape)
-    return poses, score_candidates(problem, poses, plan.score_width)
+
+    def descent(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
+        noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
+        for width in plan.widths:
+            pose = surface_steps(part, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
+        return pose, score_candidates(part, pose.unsqueeze(1), plan.score_width)[:, 0]
+
+    return _few_at_a_time(descent, problem, poses)
+
+
+def _few_at_a_time(
+    evaluate: Callable[[AlignProblem, Tensor], tuple[Tensor, Tensor]], problem: AlignProblem, poses: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return poses (B, K, num_dofs) and costs (B, K), evaluated for few candidates at a time."""
+    # The wrenches of all parts on all data are the largest table of a Jacobian.
+    pose, wrenches = poses.flatten(0, 1), 6 * problem.data.shape[1] * problem.skin.shape.num_parts
+    rows = rows_in_memory(len(pose), wrenches, pose.device)
+    found, costs = zip(*(evaluate(problem.rows(row // poses.shape[1]), pose[row]) for row in rows), strict=True)
+    return torch.cat(found).reshape(poses.shape), torch.cat(costs).reshape(poses.shape[:2])
 
 
 def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
@@ -110,7 +129,7 @@ def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tens
     return scores + problem.factor_score(poses, width)
 
 
-def align_rows(problem: AlignProblem, poses: Tensor, count: int, same: float, generator: torch.Generator) -> Tensor:
+def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return the best ``count`` of candidates (B, K, num_dofs) after an alignment of all their joints to few data.
 
     The limbs of a skinned rig are not placed one after another: the solids that stand for its parts are too rough for
@@ -126,7 +145,7 @@ def align_rows(problem: AlignProblem, poses: Tensor, count: int, same: float, ge
         pose = fit_surface(part, pose, steps=settings.surface_steps).pose
         costs = alignment_cost(part, pose).unflatten(0, (-1, candidates))
         ranked = Candidates.ranked(drawn.rows(rows), pose.unflatten(0, (-1, candidates)), costs)
-        found.append(ranked.distinct(same, count).poses)
+        found.append(ranked.distinct(SEARCH_BUDGET.alike, count).poses)
     return torch.cat(found)
 
 

@@ -6,7 +6,7 @@ import math
 import os
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -95,10 +95,6 @@ class Proposals:
     points: Tensor
     surface: Tensor
     inlier: Tensor
-
-    def repeated(self, count: int) -> Proposals:
-        """Return the same with every cloud ``count`` times in a row."""
-        return Proposals(**{item.name: getattr(self, item.name).repeat_interleave(count, 0) for item in fields(self)})
 
 
 class PoseProposer(nn.Module):

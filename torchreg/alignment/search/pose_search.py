@@ -38,16 +38,16 @@ _PRUNE = _Stage(
         num_data=150, width=0.05, beam=82, configurations=41, refine_widths=(), score_width=0.05, combinations=2,
         exchanged=0,
     ),
-    plan=Plan(widths=(0.04, 0.03, 0.025), steps=1, score_width=0.022),
+    plan=Plan(widths=(0.04, 0.03, 0.025), steps=1),
 )  # fmt: skip
 _REFINE = _Stage(
     effort=Effort(
-        num_data=250, width=0.05, beam=123, configurations=40, refine_widths=(0.04, 0.03, 0.025), score_width=0.02,
+        num_data=250, width=0.05, beam=123, configurations=40, refine_widths=_PRUNE.plan.widths, score_width=0.02,
         combinations=8, exchanged=3,
     ),
     plan=Plan(widths=(0.03, 0.022, 0.018), steps=2, score_width=0.018),
 )  # fmt: skip
-_COARSE = Plan(widths=(0.12, 0.08, 0.05, 0.03, 0.018), steps=3, score_width=0.022)
+_COARSE = Plan(widths=(0.12, 0.08, 0.05, 0.03, 0.018), steps=3)
 _SEARCH = _Search()
 
 

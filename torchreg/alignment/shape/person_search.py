@@ -36,7 +36,6 @@ class _PersonSearch:
     num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
     duplicate_limb_rms: float = 0.03  # the same, of states that differ in one limb only
-    other: float = 0.05  # the same, of fitted people: what differs by more is a rival
     turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
     most_swung: float = 0.5  # of the surface: a limb that is more is not swung, as the rest would be
     num_points: int = 250  # model points, and data, by which swung parts are ranked
@@ -128,4 +127,4 @@ def rotation_restarts(problem: ShapeProblem, state: Tensor) -> Tensor:
 
 def lead_over_rivals(problem: AlignProblem, states: Tensor, costs: Tensor) -> Tensor:
     """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity."""
-    return Candidates.ranked(problem, states[None], costs[None]).lead(_SEARCH.other)
+    return Candidates.ranked(problem, states[None], costs[None]).lead()
