@@ -206,22 +206,26 @@ class Tracker:
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
             else:
-                state = self._forgotten(state) if self._has_left(state) else state
-                pose = self._fitter.predict(state, elapsed)
-                view = self._fitter.look(state, frame, pose)
-                fit = self._fit(state, frame, view)
-                if self._was_mistaken(state, fit):
-                    state, view, fit = self._forgotten(state), None, None
-                if self._is_trusted(state, frame, fit):
-                    state = after_search(state, successful=True)
-                else:
-                    fit, state = self._recover(state, frame, view, fit)
-                fit, state = self._recover.cross_check(state, frame, fit)
-                result, state = self._accept(state, frame, fit)
+                result, state = self._tracked(state, frame)
             self._state = normal_copy(state)
             found = normal_copy(self._with_coefficients(result))
         self._follow_closer()
         return to_world(found, state.origin)
+
+    def _tracked(self, state: TrackState, frame: Frame) -> tuple[FrameResult, TrackState]:
+        """Return the result of a frame with data, and the state after it."""
+        state = self._forgotten(state) if self._has_left(state) else state
+        pose = self._fitter.predict(state, frame.elapsed)
+        view = self._fitter.look(state, frame, pose)
+        fit = self._fit(state, frame, view)
+        if self._was_mistaken(state, fit):
+            state, view, fit = self._forgotten(state), None, None
+        if self._is_trusted(state, frame, fit):
+            state = after_search(state, successful=True)
+        else:
+            fit, state = self._recover(state, frame, view, fit)
+        fit, state = self._recover.cross_check(state, frame, fit)
+        return self._accept(state, frame, fit)
 
     def run(
         self,

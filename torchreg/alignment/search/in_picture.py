@@ -103,4 +103,6 @@ def _confidence(found: Any) -> float:
 
 def _shown(found: Any) -> float:
     """Return the probability that a crop shows the shape about where a pose is, or that a start is right."""
-    return float(shown_probability(found.evidence)) if isinstance(found, AlignResult) else _confidence(found)
+    if isinstance(found, AlignResult) and found.evidence is not None:
+        return float(shown_probability(found.evidence))
+    return _confidence(found)
