@@ -22,7 +22,7 @@ class JointNumbers:
     steps: int = 15  # of a fit from each start
     loose: float = 1.0  # standard deviation where data hold nothing: a radian, or half the size of the thing
     directions: int = 400  # of the second of two hinges in a row, 7 degrees apart
-    starts: int = 6  # best of these that are refined
+    starts: int = 6  # best of these, or widest turns of one hinge, that are refined
     universal: int = 4  # frames from which two hinges in a row are fewer parameters than free motions
     ridge: float = 1e-6  # of the curvature, for directions that move no joint, as a shift along its axis
 
@@ -113,9 +113,10 @@ def _angles_about(twists: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def _screws(data: Relative, twists: Tensor) -> Tensor:
-    """Return axes (S, 1, 6) of turns to start from: those of every frame's motion, and of all together."""
+    """Return axes (S, 1, 6) of turns to start from: those of the widest motions, and of all together."""
     turns = twists[:, 3:]
-    directions = torch.cat([turns, _together(data.information[:, 3:, 3:], turns)])
+    widest = turns[turns.norm(dim=-1).argsort(descending=True)[: JOINTS.starts]]
+    directions = torch.cat([widest, _together(data.information[:, 3:, 3:], turns)])
     directions = directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     turned = so3_exp((turns @ directions.mT).mT.unsqueeze(-1) * directions.unsqueeze(1))
     return _through(data, directions.unsqueeze(1), turned.unsqueeze(2))
