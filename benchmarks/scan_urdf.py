@@ -223,7 +223,9 @@ def official_errors(path: Path, directions: Tensor, points: Tensor) -> tuple[Ten
         axes, origins = replace(arm, poses=torch.from_numpy(pose).unsqueeze(0)).axes()
         off = points - origins.unsqueeze(1)
         across = (off - (off * axes.unsqueeze(1)).sum(-1, keepdim=True) * axes.unsqueeze(1)).norm(dim=-1)
-        return torch.linalg.cross(axes.unsqueeze(1), directions.expand_as(off)).norm(dim=-1).arcsin(), across
+        return torch.linalg.cross(axes.unsqueeze(1), directions.expand_as(off)).norm(dim=-1).clamp_max(
+            1
+        ).arcsin(), across
 
     pose = tree.rest.numpy().copy()
     for width in (0.04, 0.02, 0.01, 0.01, 0.01):

@@ -64,6 +64,7 @@ def test_frames_are_reached_from_those_most_like_them_whatever_their_order():
     assert FrameTree.in_turn(2, 5) == FrameTree((1, 2, -1, 2, 3), (2, 3, 4, 1, 0))
 
 
+@pytest.mark.slow
 def test_links_that_moved_too_far_to_be_registered_are_found_from_the_base_outward():
     draw = torch.Generator().manual_seed(3)
     # Boxes with a knob on one side, whose half turns differ.

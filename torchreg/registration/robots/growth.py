@@ -24,7 +24,9 @@ class GrowthNumbers:
     explained: float = 0.45  # of an outlier's cost, from which a sample is one: right motions cost .15, wrong ones .8
     taken: float = 3.75  # from a link: nearer points of a scan are the link's
     pieces: tuple[int, ...] = (40, 100, 250)  # samples: a piece may be one small link, or must be a large one
+    free: float = 0.95  # of what a free motion explains, counts beside a hinge
     enough: float = 0.8  # of what is open, from which larger pieces are not tried
+    registered: float = 0.9  # of the samples, from which what registration left needs no search
     least: int = 12  # samples of a link
     most: int = 40  # links
     root: tuple[float, ...] = (8.0, 6.0, 4.0, 3.0, 2.0, 1.0, 1.0)  # kernels by which the first link is fitted
@@ -146,10 +148,15 @@ class Growth:
         distances, best = own[0].norm(dim=-1).sort().values, (0.0, parent)
         for size in GROWTH.pieces:
             radius = float(distances[min(size, len(distances)) - 1]) + self.surfaces.spacing
-            for local in rotations_and_hinge(Piece.of(own, seen, radius, self.surfaces.spacing)):
+            # Free motions have many more parameters than a hinge.
+            for share, local in zip(
+                (1.0, GROWTH.free),
+                rotations_and_hinge(Piece.of(own, seen, radius, self.surfaces.spacing)),
+                strict=False,
+            ):
                 motion = parent @ shift @ local.double() @ invert_rigid(shift)
                 costs = self.costs(motion.unsqueeze(1), front.open)[:, 0]
-                gain = float((1 - costs / GROWTH.explained).clamp_min(0).sum())
+                gain = share * float((1 - costs / GROWTH.explained).clamp_min(0).sum())
                 best = max(best, (gain, motion), key=lambda row: row[0])
             if size >= len(distances) or best[0] > GROWTH.enough * len(distances):
                 break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ class JointNumbers:
     steps: int = 15  # of a fit from each start
     loose: float = 1.0  # standard deviation where data hold nothing: a radian, or half the size of the thing
     directions: int = 400  # of the second of two hinges in a row, 7 degrees apart
-    starts: int = 6  # best of these that are refined
+    starts: int = 6  # best of these, or widest turns of one hinge, that are refined
     universal: int = 4  # frames from which two hinges in a row are fewer parameters than free motions
     ridge: float = 1e-6  # of the curvature, for directions that move no joint, as a shift along its axis
 
@@ -80,7 +80,8 @@ def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Nois
 def best_joint(data: Relative) -> Candidate:
     """Return the joint of least description length: squared errors in standard deviations, and parameters.
 
-    Two hinges in a row, between which a link moves that no scan shows to turn, are tried where no single joint holds.
+    Two hinges in a row, between which a link moves that no scan shows to turn, are tried where no single joint holds;
+    so is one hinge with one frame that is wrong.
     """
     frames, rate = len(data.motions), math.log(data.count)
     twists = se3_log(data.motions)
@@ -91,20 +92,38 @@ def best_joint(data: Relative) -> Candidate:
         "revolute": _fitted(data, _screws(data, twists), _angles_about(twists)),
         "prismatic": _fitted(data, _slides(data, twists), lambda axes: twists[None, :, :3] @ axes[..., :3].mT),
     }
-    parameters = {"fixed": 0, "revolute": frames + 4, "prismatic": frames + 2, "universal": 2 * frames + 8}
+    parameters = {
+        "fixed": 0,
+        "revolute": frames + 4,
+        "prismatic": frames + 2,
+        "universal": 2 * frames + 8,
+        "outlier": frames + 9,
+    }
 
     def length(kind: str) -> float:
         return found[kind][0] + (parameters[kind] - 6 * frames) * rate
 
     if min(map(length, found)) > 0 and frames >= JOINTS.universal:
         found["universal"] = _fitted(data, _crosses(data), _two_angles(data))
+        found["outlier"] = _without_worst(data, twists, *found["revolute"][1:])
     kind = min(found, key=length)
-    _, axes, values = found[kind]
+    (_, axes, values), size = found[kind], length(kind)
+    kind = "revolute" if kind == "outlier" else kind
     if kind == "prismatic":
-        return Candidate(kind, axes, data.unit * values, length(kind))
+        return Candidate(kind, axes, data.unit * values, size)
     # From half sizes about a center back to lengths about the origin.
     shift = data.unit * axes[:, :3] + torch.linalg.cross(data.center.expand(len(axes), 3), axes[:, 3:])
-    return Candidate(kind, torch.cat([shift, axes[:, 3:]], -1), values, length(kind))
+    return Candidate(kind, torch.cat([shift, axes[:, 3:]], -1), values, size)
+
+
+def _without_worst(data: Relative, twists: Tensor, axes: Tensor, values: Tensor) -> tuple[float, Tensor, Tensor]:
+    """Return `_fitted` of one hinge to all frames but the one that it fits least."""
+    error = se3_log(data.motions @ invert_rigid(se3_exp(values * axes)))
+    worst = int((error.unsqueeze(-2) @ data.information @ error.unsqueeze(-1)).flatten().argmax())
+    kept = torch.arange(len(values)) != worst
+    rest = replace(data, motions=data.motions[kept], information=data.information[kept])
+    cost, axes, _ = _fitted(rest, _screws(rest, twists[kept]), _angles_about(twists[kept]))
+    return cost, axes, _angles_about(twists)(axes.unsqueeze(0))[0]
 
 
 def _angles_about(twists: Tensor) -> Callable[[Tensor], Tensor]:
@@ -113,9 +132,10 @@ def _angles_about(twists: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def _screws(data: Relative, twists: Tensor) -> Tensor:
-    """Return axes (S, 1, 6) of turns to start from: those of every frame's motion, and of all together."""
+    """Return axes (S, 1, 6) of turns to start from: those of the widest motions, and of all together."""
     turns = twists[:, 3:]
-    directions = torch.cat([turns, _together(data.information[:, 3:, 3:], turns)])
+    widest = turns[turns.norm(dim=-1).argsort(descending=True)[: JOINTS.starts]]
+    directions = torch.cat([widest, _together(data.information[:, 3:, 3:], turns)])
     directions = directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     turned = so3_exp((turns @ directions.mT).mT.unsqueeze(-1) * directions.unsqueeze(1))
     return _through(data, directions.unsqueeze(1), turned.unsqueeze(2))

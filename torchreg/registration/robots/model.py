@@ -22,7 +22,7 @@ from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
 from torchreg.registration.robots.fit import HasBlocks, Mechanism, axis_stds, fitted, settled
 from torchreg.registration.robots.fusion import FusedScans
-from torchreg.registration.robots.growth import grown
+from torchreg.registration.robots.growth import GROWTH, Growth, grown
 from torchreg.registration.robots.joints import Candidate, best_joint, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
@@ -146,12 +146,13 @@ def find_robot(
 
 
 def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the motions (T, K, 4, 4) and those of links that are found one after another; the better labels (n,)."""
+    """Return motions (T, K, 4, 4) and labels (n,), those of links found one after another where parts do not fit."""
+    motions = surfaces.refined(motions, label, [scale * surfaces.spacing for scale in GROWTH.others])
+    costs = Growth(surfaces, motions, label).costs(motions).gather(1, label.unsqueeze(1))
+    if float((costs < GROWTH.explained).double().mean()) > GROWTH.registered:
+        return motions, label
     found, new = grown(surfaces, motions)
-    new = new + motions.shape[1]
-    motions = torch.cat([motions, found], 1)
-    costs = [float(surfaces.cost(motions, labels, surfaces.spacing).sum()) for labels in (label, new)]
-    return motions, label if costs[0] < costs[1] else new
+    return torch.cat([motions, found], 1), new + motions.shape[1]
 
 
 def compared_with_each_other(

@@ -32,6 +32,7 @@ class PieceNumbers:
     fine: float = 2.5  # distances between points: kernel of the last comparison
     least: float = 2.0  # the same: least kernel, as points of a surface sampled anew are as far apart
     tangential: float = 0.1  # weight of offsets along the surface, where planes leave a motion open
+    half_turn: float = 0.02  # cost of a half turn, beside those of points: of two equal motions the smaller is likelier
     cells: int = 16  # along the radius
     damping: float = 0.01  # of a point's weight, for what a piece leaves open
 
@@ -123,7 +124,9 @@ class Piece:
         """Return the mean squared distances (T, C), up to one kernel width, of both under motions (T, C, 4, 4)."""
         there, back = ((offset.square().sum(-1) / width**2).clamp_max(1) for _, offset, _ in self._matched(motions))
         valid = self.valid.unsqueeze(1)
-        return 0.5 * (there.mean(-1) + (valid * back).sum(-1) / valid.sum(-1).clamp_min(1))
+        fit = 0.5 * (there.mean(-1) + (valid * back).sum(-1) / valid.sum(-1).clamp_min(1))
+        # (3 - trace) / 4 is one for a half turn.
+        return fit + PIECES.half_turn * (3 - motions[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)) / 4
 
     def _matched(self, motions: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], ...]:
         """Return moved points (T, C, ., 3), their offsets and normals: of the piece, and of what the scans show."""
@@ -165,7 +168,7 @@ def _thinned(cloud: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def rotations_and_hinge(piece: Piece) -> list[Tensor]:
-    """Return motions (T, 4, 4) of a piece: the best of each scan alone, and those of the best hinge that all share.
+    """Return motions (T, 4, 4) of a piece: those of the best hinge that all scans share, and the best of each alone.
 
     All rotations about the place are compared, the best refined; hinges have the axes of those of single scans.
     """
@@ -185,7 +188,7 @@ def rotations_and_hinge(piece: Piece) -> list[Tensor]:
         return [motions[:, 0]]
     point = torch.linalg.cross(twists[:, 3:], twists[:, :3])
     hinges = torch.cat([torch.linalg.cross(point, twists[:, 3:]), twists[:, 3:]], -1)
-    return [motions[:, 0], piece.refined(_turned(piece, hinges).unsqueeze(1), widths[-4:])[:, 0]]
+    return [piece.refined(_turned(piece, hinges).unsqueeze(1), widths[-4:])[:, 0], motions[:, 0]]
 
 
 def _best(motions: Tensor, costs: Tensor, count: int) -> Tensor:

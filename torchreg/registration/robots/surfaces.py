@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -126,13 +126,17 @@ class Surfaces:
         points = (turn @ self.samples.unsqueeze(-1)).squeeze(-1) + transforms[..., :3, 3]
         return points, (turn @ self.normals.unsqueeze(-1)).squeeze(-1)
 
-    def squares(self, motions: Tensor, reach: float) -> Tensor:
-        """Return squared distances (T, n, K) of the samples from the scans, under K motions (T, K, 4, 4)."""
-        rows = []
-        for target, frame in zip(self.targets, motions, strict=True):
-            points, normals = self.moved(frame.unsqueeze(1))
-            rows.append(target.residuals(points, normals, reach)[2].mT)
-        return torch.stack(rows)
+    def squares(self, motions: Tensor, reach: float, asked: Tensor) -> Tensor:
+        """Return squared distances (T, n, K) of the samples from the scans, under K motions (T, K, 4, 4).
+
+        Those that are not ``asked`` for (n, K) are infinite.
+        """
+        which, number = asked.nonzero().unbind(1)
+        own = replace(self, samples=self.samples[which], normals=self.normals[which])
+        squares = torch.full((len(motions), *asked.shape), torch.inf, dtype=torch.float64)
+        for row, target, frame in zip(squares, self.targets, motions, strict=True):
+            row[which, number] = target.residuals(*own.moved(frame[number]), reach)[2]
+        return squares
 
     def noise(self, motions: Tensor, label: Tensor) -> Noise:
         """Return the noise of the samples' residuals under the motions (T, K, 4, 4) of their parts (n,)."""
