@@ -40,7 +40,10 @@ def test_encoders_tell_what_no_data_show(arm, tracking, sequence):
 
 
 def test_what_is_locked_is_held_where_the_shape_is_searched(arm, tracking, sequence):
-    poses, clouds = sequence
+    straight = sequence[0][0].clone()
+    straight[HINGE] = 0.0
     tracker = tr.Tracker(arm, config=CONFIG, model_points=tracking.skin, locked=["arm"])
-    first = tracker.step(clouds[0], prior=({"base_x": float(poses[0, 0])}, 0.01))
+    first = tracker.step(tracking.skin(straight), prior=({"base_x": float(straight[0])}, 0.01))
     assert float(first.pose[HINGE]) == pytest.approx(0.0, abs=1e-9)
+    assert first.status.usable
+    assert float(first.residual) < 0.001

@@ -117,6 +117,7 @@ def align(
     """
     views.check()
     check_used(fit_shape, "--fit-shape", {"--rig": rig, "--clothed": clothed if clothed != "auto" else None})
+    worn = read_clothed(clothed)
     _check_together(shape, rig, searched_upright=upright and start is not None, in_picture=views.depth, support=support)
     pictures = views.source(clouds) if views.depth else None
     direction = known_up(up, clouds, camera=views.depth)
@@ -140,7 +141,7 @@ def align(
             options.load(shape_of_side(shape, side)), config,
             pictures.__getitem__ if pictures else lambda k: read_cloud(clouds[k], scale, nan_policy, time, frame),
             clouds, files, bar, fit_shape=fit_shape, rig=(shape, chosen_skin(options.skin)), up=direction,
-            support=support, clothed=read_clothed(clothed),
+            support=support, clothed=worn,
         )  # fmt: skip
         run.prepare(start, initializer, side, upright)
         run.known = known.read(run.shape, clouds, pictures, any_side=side == "either")

@@ -62,7 +62,7 @@ def register(
         float | None,
         typer.Option(
             min=0,
-            help="Noise of depths at one metre, metres, by which they are smoothed; by default that of the background",
+            help="Noise of depths at one metre, metres, by which they are smoothed; by default that of the background.",
         ),
     ] = None,
     seen: Seen = None,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION, confidence_of
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
@@ -50,6 +51,8 @@ class RecoveryPlan:
     # Confidence of a search everywhere in data that show the shape: of made-up hands with a forearm and a wall it is
     # .27 to .69 in 18 of 19 frames, and .01 to .12 where the hand is left out.
     min_confidence: float = 0.2
+    # The same where other poses that explain the data as well do not count: a symmetric shape has such, and fits.
+    symmetric_confidence: float = 0.95
 
 
 _PLAN = RecoveryPlan()
@@ -107,7 +110,15 @@ class Recovery:
             other, sure = self._find(state, frame, config)
             if best is None or (other is not None and other.soft_inliers > best.soft_inliers):
                 best, confidence = other, sure
-        return best if confidence >= _PLAN.min_confidence else None
+        return best if confidence >= _PLAN.min_confidence or self._is_symmetric(best) else None
+
+    def _is_symmetric(self, fit: FrameFit | None) -> bool:
+        """Return whether data surely show the shape, though perhaps in another of several alike poses."""
+        if fit is None:
+            return False
+        evidence, _ = self.fitter.judged(fit, self.fitter.covariance(fit)[0])
+        calibration = CALIBRATION if fit.person is None else SHAPE_CALIBRATION
+        return float(confidence_of(evidence.table(), calibration)) >= _PLAN.symmetric_confidence
 
     def _find(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> tuple[FrameFit | None, float]:
         """Return the fit of a search, and the confidence that the data show the shape there."""
