@@ -236,7 +236,7 @@ def official_errors(path: Path, directions: Tensor, points: Tensor) -> tuple[Ten
             angle, across = errors(pose)
             return torch.cat([0.1 * angle[own], across[own]]).numpy()
 
-        pose = least_squares(residuals, pose, loss="cauchy", f_scale=width).x
+        pose = least_squares(residuals, pose, loss="cauchy", f_scale=width, max_nfev=25).x
     angle, across = errors(pose)
     return torch.rad2deg(angle[own]), across[own]
 

@@ -114,7 +114,7 @@ def test_scans_of_a_robot_become_its_description(done, error_of, registered, tmp
     three = ("register", *(registered[0] / f"{name}.ply" for name in ("source", "target", "bare")))
     kinds = [SimpleNamespace(name="joint_1", kind="revolute")]
     robot = SimpleNamespace(
-        tree=type("Tree", (list,), {"joints": [None, *kinds]})([0, 1]), loose=("joint_1",),
+        tree=type("Tree", (list,), {"joints": [None, *kinds]})([0, 1]), loose=("joint_1",), undetermined=("joint_1",),
         joint_values=torch.tensor([[0.0], [0.25], [-0.5]]), residuals=torch.tensor([0.0, 0.001, 0.002]),
     )  # fmt: skip
     asked = []
@@ -138,6 +138,7 @@ def test_scans_of_a_robot_become_its_description(done, error_of, registered, tmp
     assert asked == [(3, 8, 25, "auto"), tmp_path / "robot.safetensors", tmp_path / "robot.urdf"]
     assert "converged, confidence 70% in the worst scan: 2 links, 1 hinges and 0 sliders" in output
     assert "joint_1 does not explain how its two links move" in output
+    assert "the axis of joint_1 is not determined" in output
     lines = (tmp_path / "robot_joints.csv").read_text().splitlines()
     assert lines == ["scan,joint_1", "source.ply,0.0", "target.ply,0.25", "bare.ply,-0.5"]
     for options, message in [
