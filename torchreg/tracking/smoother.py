@@ -172,7 +172,8 @@ class _Smoother:
                 * covariance[first - second][first : first + len(bend)].diagonal(dim1=-2, dim2=-1)
                 for first in range(3) for second in range(first + 1)
             )  # fmt: skip
-            squares = _accelerations(poses, times).square() + spread
+            # Rounding makes the small difference of large variances negative.
+            squares = _accelerations(poses, times).square() + torch.as_tensor(spread).clamp_min(0)
             count = len(scale)
             weights = (_SMOOTHING.tails + count) / (_SMOOTHING.tails + (squares / scale).sum(-1))
             scale = (weights.unsqueeze(-1) * squares).mean(0).clamp_min(_SMOOTHING.held**2)
