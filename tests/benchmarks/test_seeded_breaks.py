@@ -34,5 +34,13 @@ def test_each_break_is_another_program(bench, checkout):
 def test_a_break_is_noticed_by_the_test_of_its_module(bench, checkout):
     minus = next(item for item in bench.drawn(20, 0, checkout) if item.text == " + ")
     assert bench.tests_of(minus, checkout) == ["tests/room/test_near.py"]
-    assert bench.outcome(minus, checkout, 60) == "noticed"
+    assert bench.outcome(minus, checkout, bench.tests_of(minus, checkout), 60) == "noticed"
     assert (checkout / minus.file).read_text() == SOURCE
+    assert bench.outcome(minus, checkout, [], 60) == "MISSED"
+
+
+def test_the_tests_that_run_the_line_of_a_break_are_found(bench, checkout):
+    pytest.importorskip("pytest_cov")
+    minus = next(item for item in bench.drawn(20, 0, checkout) if item.text == " + ")
+    covered = bench.coverage_of(checkout, checkout / "covered.db")
+    assert bench.covering(minus, checkout, covered) == ["tests/room/test_near.py::test_near"]
