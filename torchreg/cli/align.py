@@ -28,11 +28,20 @@ from torchreg.cli.align_options import (
     read_cloud,
     read_schedule,
 )
-from torchreg.cli.cameras import DepthOptions, check_used
+from torchreg.cli.cameras import DepthOptions
 from torchreg.cli.export import Old, check_old
 from torchreg.cli.hand_side import Side, better_hand, shape_of_side
 from torchreg.cli.known_options import Initializer, Known, KnownOptions, observability, read_initializer
-from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending, written_to
+from torchreg.cli.outputs import (
+    PICTURE_ENDINGS,
+    Force,
+    Quiet,
+    check_outputs,
+    check_used,
+    numbered,
+    with_ending,
+    written_to,
+)
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import Shape, ShapeOptions, chosen_skin
 from torchreg.cli.upright import Up, Upright, known_up, remembering
@@ -116,8 +125,8 @@ def align(
     whole picture, or an output other than the results could not be written; 2 for an error; 130 for Ctrl-C.
     """
     views.check()
-    check_used(fit_shape, "--fit-shape", {"--rig": rig, "--clothed": clothed if clothed != "auto" else None})
-    worn = read_clothed(clothed)
+    check_used(fit_shape, "--fit-shape", {"--rig": rig})
+    worn = read_clothed(clothed, fit_shape)
     _check_together(shape, rig, searched_upright=upright and start is not None, in_picture=views.depth, support=support)
     pictures = views.source(clouds) if views.depth else None
     direction = known_up(up, clouds, camera=views.depth)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchreg.cli.outputs import check_used
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,10 +60,11 @@ def fitted_shape(shape: ArticulatedShape, wanted: bool) -> ArticulatedShape:
     return shape.with_bone_coefficients() if wanted and not shape.coefficient_names else shape
 
 
-def read_clothed(text: str) -> bool | str:
-    """Return what `align` takes as ``clothed``."""
+def read_clothed(text: str, fit_shape: bool) -> bool | str:
+    """Return what `align` takes as ``clothed``; clothes need a fitted body."""
     from torchreg._checks import check_choice
 
+    check_used(fit_shape, "--fit-shape", {"--clothed": text if text != "auto" else None})
     check_choice(text, "--clothed", ("auto", "yes", "no"))
     return {"yes": True, "no": False}.get(text, text)
 

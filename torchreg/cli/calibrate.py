@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
-from torchreg.cli.cameras import DepthOptions, Seen, check_used, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending, written_to
+from torchreg.cli.cameras import DepthOptions, Seen, seen_folder
+from torchreg.cli.outputs import Force, Quiet, check_outputs, check_used, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.shape_argument import PackageDir, Shape, ShapeOptions
 from torchreg.cli.writers import Source, write_optional

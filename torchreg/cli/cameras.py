@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import cloud_files
+from torchreg.cli.outputs import check_used
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,13 +43,6 @@ Mask = Annotated[
 Seen = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Where pictures of what was seen go; by default RESULT_seen.")
 ]
-
-
-def check_used(wanted: bool, flag: str, options: Mapping[str, Any]) -> None:
-    """Raise InputError if options are given that have no meaning without a flag."""
-    for name, value in options.items():
-        if value is not None and not wanted:
-            raise InputError(f"{name} has no meaning without {flag}; leave it out")
 
 
 def seen_folder(seen: Path | None, result: Path, force: bool) -> Path:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.cameras import check_used
+from torchreg.cli.outputs import check_used
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:

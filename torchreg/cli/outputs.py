@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -37,6 +37,13 @@ PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs that exist.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+
+
+def check_used(wanted: bool, flag: str, options: Mapping[str, Any]) -> None:
+    """Raise InputError if options are given that have no meaning without a flag."""
+    for name, value in options.items():
+        if value is not None and not wanted:
+            raise InputError(f"{name} has no meaning without {flag}; leave it out")
 
 
 def written_to(metavar: str, words: str) -> Any:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Support, cloud_files
-from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folder
+from torchreg.cli.cameras import Depth, DepthRange, Seen, seen_folder
 from torchreg.cli.export import Old, check_old
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending, written_to
+from torchreg.cli.outputs import Force, Quiet, check_outputs, check_used, with_ending, written_to
 from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.cli.writers import Source, joint_table, save_robot, write_optional

@@ -11,9 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, Support, cloud_files
-from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
+from torchreg.cli.cameras import Calibration, Seen, load_calibration, seen_folder
 from torchreg.cli.export import Old, check_old
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, with_ending, written_to
+from torchreg.cli.outputs import (
+    Force,
+    Quiet,
+    check_outputs,
+    check_used,
+    claimed,
+    counted,
+    numbered,
+    with_ending,
+    written_to,
+)
 from torchreg.cli.reporting import OptionalOutput, interruption, reporting
 from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.cli.writers import PICTURES, Source, write_optional

@@ -19,7 +19,7 @@ from torchreg.cli.align_options import (
     person_summary,
     read_clothed,
 )
-from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, check_used, seen_folder
+from torchreg.cli.cameras import DepthOptions, Seen, StereoOptions, seen_folder
 from torchreg.cli.export import Old, OldWord, check_old
 from torchreg.cli.known_options import Initializer, KnownOptions, read_initializer
 from torchreg.cli.outputs import Force, Quiet, claimed, shifted_to, with_ending, written_to
@@ -161,14 +161,10 @@ def track(
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
     cameras.check(seen, views)
-    check_used(fit_shape, "--fit-shape", {"--clothed": clothed if clothed != "auto" else None})
-    worn = read_clothed(clothed)
+    worn = read_clothed(clothed, fit_shape)
     model = options.load(shape)
-    if cameras.stereo:
-        source: Any = cameras.source(frames, model, views.depth_range, scale)
-        folder = seen_folder(seen, result, force or resumed)
-    else:
-        source = views.frames(frames, scale, nan_policy)
+    source = _source(frames, model, cameras, views, scale, nan_policy)
+    folder = seen_folder(seen, result, force or resumed) if cameras.stereo else None
     clouds = Clouds(source, floating=not cameras.stereo)
     direction = known_up(up, frames, camera=cameras.stereo or views.depth)
     config = settings.config(direction, clouds)
@@ -191,7 +187,7 @@ def track(
             tracker, clouds, fps, job, files, report=Report(bar, clouds, quiet), save_every=save_every, known=given,
             up=direction, smooth=smooth,
         )  # fmt: skip
-        run.seen = _drawn_pictures(source, folder) if cameras.stereo else None
+        run.seen = None if folder is None else _drawn_pictures(source, folder)
         run.live = _live_page(pages, port, browser, quiet, direction) if view else None
         complete = run.run(resumed)
     _report_end(run, model, complete, quiet)
@@ -215,6 +211,15 @@ def _files(
     check_old({"--movie": (movie and drawn, ""), "--pictures": (pictures, "")}, result, measured)
     scene = None if no_gltf else gltf or result.with_suffix(".glb")
     return TrackFiles(result, drawn, scene, pictures, poses, bvh)
+
+
+def _source(
+    frames: list[Path], model: ArticulatedShape, cameras: StereoOptions, views: DepthOptions, scale: float, policy: str
+) -> Any:
+    """Return the frames that the files hold: stereo or depth pictures, or clouds."""
+    if cameras.stereo:
+        return cameras.source(frames, model, views.depth_range, scale)
+    return views.frames(frames, scale, policy)
 
 
 def _progress_bar(count: int, quiet: bool) -> Any:
