@@ -157,12 +157,12 @@ class _Smoother:
         for _ in range(_SMOOTHING.rounds):
             gradient, blocks = self._data(data, poses, still)
             bend, steps = _accelerations(poses, times), _coefficients(times)
-            pull = weights.unsqueeze(-1) / scale
+            precision = weights.unsqueeze(-1) / scale
             for first in range(3):
                 rows = slice(first, first + len(bend))
-                gradient[rows] += steps[:, first, None] * pull * bend
+                gradient[rows] += steps[:, first, None] * precision * bend
                 for second in range(first + 1):
-                    share = (steps[:, first] * steps[:, second]).unsqueeze(-1) * pull
+                    share = (steps[:, first] * steps[:, second]).unsqueeze(-1) * precision
                     blocks[first - second][rows].diagonal(dim1=-2, dim2=-1).add_(share)
             system = BandedSystem(blocks)
             poses = retract(poses, -system.solve(gradient))

@@ -145,10 +145,10 @@ class Piece:
             arm, offset, normal = (torch.cat(pair, -2) for pair in zip(*self._matched(motions), strict=True))
             valid = torch.nn.functional.pad(self.valid, (len(self.points), 0), value=1.0).unsqueeze(1)
             weight = (valid * geman_mcclure_weight(offset.square().sum(-1) / width**2))[..., None, None]
-            pull = weight * (normal.unsqueeze(-1) * normal.unsqueeze(-2) + PIECES.tangential * eye)
-            jacobian = torch.cat([eye.expand_as(pull), -skew(arm)], -1)
-            hessian = (jacobian.mT @ pull @ jacobian).sum(-3)
-            gradient = (jacobian.mT @ pull @ offset.unsqueeze(-1)).sum(-3)
+            information = weight * (normal.unsqueeze(-1) * normal.unsqueeze(-2) + PIECES.tangential * eye)
+            jacobian = torch.cat([eye.expand_as(information), -skew(arm)], -1)
+            hessian = (jacobian.mT @ information @ jacobian).sum(-3)
+            gradient = (jacobian.mT @ information @ offset.unsqueeze(-1)).sum(-3)
             ridge = PIECES.damping * weight.sum((-3, -2)) * metric + 1e-9
             step = -torch.linalg.solve(hessian + torch.diag_embed(ridge), gradient).squeeze(-1)
             motions = turn_about(motions, step, motions.new_zeros(3))
