@@ -6,8 +6,9 @@ import torch
 import torchreg as tr
 from experiments.made_up.depth_noise import DepthNoise
 from experiments.made_up.rooms import box, joined, moved
+from torchreg.capture.moved import moved_scans
 from torchreg.errors import FileWarning, InputTypeError
-from torchreg.geometry.rigid import se3_exp
+from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.geometry.visibility import rasterize
 
 EYE = torch.eye(3)
@@ -92,6 +93,24 @@ def test_nothing_moved_gives_empty_masks_and_a_registration_of_everything():
     frames, _ = pictures(figure(ARM_DOWN), figure(ARM_DOWN), noise=DepthNoise(quadratic=1e-3))
     found = tr.moved_masks(*frames)
     assert not (found.source | found.target).any()
+    assert torch.equal(found.motion, STILL)
+    with pytest.warns(FileWarning, match="nothing is found to move"):
+        scans = moved_scans(*frames)
+    assert len(scans[0].points) == int(frames[0].measured.sum())
+
+
+@pytest.mark.parametrize("noise", [None, DepthNoise(quadratic=1e-3)])
+def test_a_camera_in_a_hand_does_not_make_the_room_move(noise):
+    motion = se3_exp(torch.tensor([0.05, -0.02, 0.08, 0.02, -0.03, 0.02], dtype=torch.float64))
+    frames, masks = pictures(figure(ARM_DOWN), figure(ARM_UP, 0.25), motion=motion, noise=noise)
+    unknown = [tr.DepthFrame(frame.depth, frames[0].camera) for frame in frames]
+    found = tr.moved_masks(*unknown)
+    corners = torch.tensor([[-0.9, 0.35, 3.0], [-1.5, 0.9, 3.0], [1.5, 0.9, 4.0]], dtype=torch.float64)
+    there, true = transform_points(found.motion, corners), transform_points(motion, corners)
+    # No surface of the room holds a slide to the side.
+    assert (there - true)[:, 1:].norm(dim=-1).max() < 0.02
+    for mask, true, frame in zip((found.source, found.target), masks, frames, strict=True):
+        assert overlap(mask, true, frame) > 0.8
 
 
 def test_a_registration_of_two_pictures_is_of_what_moved():

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.capture.background_motion import background_motion, depth_noise
 from torchreg.capture.depth import depth_scan
 from torchreg.capture.depth_frame import DepthFrame, pooled
 from torchreg.capture.depth_segments import SurfaceGrid
 from torchreg.errors import FileWarning, InputTypeError
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import invert_rigid
 
 
 @dataclass(frozen=True)
@@ -42,21 +44,25 @@ class MovedMasks:
         source: (H, W) bool, pixels of the first picture.
         target: (H', W') bool, pixels of the second one.
         noise: standard deviation of depths at one metre, metres; it grows with the square of the depth.
+        motion: (4, 4) float64, the rigid motion of the background from the first picture to the second one; it is that
+            of a camera in a hand, too.
     """
 
     source: Tensor
     target: Tensor
     noise: float
+    motion: Tensor
 
 
 @torch.no_grad()
 def moved_masks(source: DepthFrame, target: DepthFrame) -> MovedMasks:
-    """Return which pixels of two depth pictures show what moved between them; camera poses are known, or one.
+    """Return which pixels of two depth pictures show what moved between them, against their background.
 
     A place is gone if the other picture shows what is behind it. A surface is a set of pixels without a step in depth
     between them, after large planes that stay are removed. It moved, as a whole, if a tenth of it is gone. It also
-    moved if three tenths are gone, show what moved in the other picture, or are hidden by that. The noise of depths is
-    estimated from their differences, as most pixels show the background.
+    moved if three tenths are gone, show what moved in the other picture, or are hidden by that. The cameras may be in
+    a hand, or the background may be a body that turns: its rigid motion, and the noise of depths, are estimated from
+    the pictures, see `background_motion`.
 
     Args:
         source: H x W pixels; those off its mask count as background.
@@ -75,17 +81,19 @@ def moved_masks(source: DepthFrame, target: DepthFrame) -> MovedMasks:
     for name, frame in (("source", source), ("target", target)):
         if not isinstance(frame, DepthFrame):
             raise InputTypeError(f"{name} must be a DepthFrame, got {type(frame).__name__}")
+    motion = background_motion(source, target)
+    target = DepthFrame(target.depth, target.camera.moved(invert_rigid(motion)), target.mask)
     views = _Comparison.of(source, target), _Comparison.of(target, source)
     size = max(view.size_of_change() for view in views)
     if size == 0:
-        return MovedMasks(torch.zeros_like(views[0].gone), torch.zeros_like(views[1].gone), views[0].noise)
+        return MovedMasks(torch.zeros_like(views[0].gone), torch.zeros_like(views[1].gone), views[0].noise, motion)
     surfaces = [_Surfaces.of(view, size) for view in views]
     gone = [found.mask(found.gone, found.same, _RULE.gone) for found in surfaces]
     both = []
     for found, own, other in zip(surfaces, gone, gone[::-1], strict=True):
         carried = found.grid.at(found.view.shows(other, _RULE.near * size))
         both.append(own | found.mask(found.gone | carried, found.same & ~carried, _RULE.carried))
-    return MovedMasks(both[0], both[1], views[0].noise)
+    return MovedMasks(both[0], both[1], views[0].noise, motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +132,7 @@ class _Comparison:
         farthest = pooled(torch.where(shown > 0, shown, -torch.inf), 1).reshape(-1)[number]
         measured = inside & (shown.reshape(-1)[number] > 0)
         off = ((shown.reshape(-1)[number] - depth) / depth.square())[measured]
-        noise = float(off.abs().median()) / (0.6745 * 2**0.5) if len(off) else 0.0
+        noise = depth_noise(off) / 2**0.5
         reach = _RULE.deviations * 2**0.5 * noise * depth.square()
         known = inside & farthest.isfinite()
         gone, hidden = known & (depth < nearest - reach), known & (depth > farthest + reach)
@@ -219,7 +227,7 @@ class _Surfaces:
 def moved_scans(
     source: DepthFrame, target: DepthFrame, *, smoothing: float | None = None, stacklevel: int = 1
 ) -> tuple[RangeScan, RangeScan]:
-    """Return scans of what moved between two depth pictures, and warn; of all that counts if nothing did.
+    """Return scans of what moved between two depth pictures, of all that counts if nothing did, and warn.
 
     Pictures with masks are scanned as these say. ``smoothing`` is that of `depth_scan`; by default the noise of the
     depths where it is known, from the background.
@@ -231,13 +239,14 @@ def moved_scans(
             smoothing = moved.noise if smoothing is None else smoothing
             left = [int((whole & ~mask).sum()) for whole, mask in zip(masks, (moved.source, moved.target), strict=True)]
             masks = (moved.source, moved.target)
-            warnings.warn(
+            what = (
                 f"{left[0]} of {left[0] + int(masks[0].sum())} pixels of source and {left[1]} of "
                 f"{left[1] + int(masks[1].sum())} of target show what did not move, and are left out; pass "
-                f"support='keep' to keep them",
-                FileWarning,
-                stacklevel=stacklevel + 1,
+                f"support='keep' to keep them"
             )
+        else:
+            what = "nothing is found to move between source and target, so all that they show counts; pass masks"
+        warnings.warn(what, FileWarning, stacklevel=stacklevel + 1)
     first, second = (
         depth_scan(torch.where(mask, frame.depth, 0.0), frame.camera, smoothing=smoothing or 0.0)
         for frame, mask in zip(frames, masks, strict=True)
