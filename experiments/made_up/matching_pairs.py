@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg.datasets.depth_scanner import DepthScanner, SurfaceScan
 from torchreg.datasets.figures import Figure, meshed_figure
 from torchreg.errors import InputError
-from torchreg.geometry.mesh import TriangleMesh, interpolate
+from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import rigid_matrix
@@ -102,6 +102,7 @@ def matching_pairs(
     *,
     bodies: Callable[[Draw], tuple[str, PosableBody]] | None = None,
     body_share: float = 0.4,
+    whole: float = 0.0,
 ) -> Iterator[MatchingPair]:
     """Yield pairs of scans of creatures, each creature new at every few pairs, without end.
 
@@ -110,6 +111,7 @@ def matching_pairs(
         kinds: what is drawn, with the share of each; `TRAINING_KINDS` by default.
         bodies: draws a further body, such as a rig of a user, and its kind; each is warped and scaled anew.
         body_share: of the pairs that show one of those.
+        whole: of the pairs whose scans are of all sides, as complete meshes are.
 
     Cost: 0.3 s a pair.
     """
@@ -124,7 +126,7 @@ def matching_pairs(
             body = drawn_body(kinds[kind][0], draw)
         body = _warped(body, draw)
         for _ in range(_VARIETY.pairs_per_creature):
-            pair = _pair(kind, body, draw)
+            pair = _pair(kind, body, draw, whole=whole > 0 and draw.chance(whole))
             if pair is not None:
                 yield pair
 
@@ -169,10 +171,10 @@ def _waves(
     return lambda points: (points @ wave.mT + phase).sin() @ along
 
 
-def _pair(kind: str, body: PosableBody, draw: Draw) -> MatchingPair | None:
+def _pair(kind: str, body: PosableBody, draw: Draw, *, whole: bool) -> MatchingPair | None:
     """Return a pair of scans of a body in two random poses; None where little of both is common."""
     meshes = two_poses(body, draw)
-    scans = _two_scans(body, meshes, draw)
+    scans = [_whole_scan(mesh, draw) for mesh in meshes] if whole else _two_scans(body, meshes, draw)
     if scans is None:
         return None
     sides = []
@@ -286,6 +288,18 @@ def _two_scans(
         # The turn and shift to before the camera go again; a turn of the scan stays.
         scans.append((replace(found, scan=found.scan.transformed(motion.to(found.scan.points))), turn))
     return scans
+
+
+def _whole_scan(mesh: TriangleMesh, draw: Draw) -> tuple[SurfaceScan, Tensor]:
+    """Return points of all sides of a surface, and the rotation (3, 3) that takes the surface to their coordinates."""
+    turn = _scan_turn(draw)
+    turned = TriangleMesh(mesh.vertices @ turn.mT, mesh.faces)
+    points, face, shares = sample_surface(turned, draw.count(*_VARIETY.num_points), generator=draw.generator)
+    diagonal = float((turned.vertices.amax(0) - turned.vertices.amin(0)).norm())
+    noise = _VARIETY.noise * draw.uniform(0, 1) * diagonal * draw.normal(*points.shape)
+    normals = interpolate(turned.vertex_normals(), mesh.faces, face, shares)
+    scan = RangeScan((points + noise).float(), normals=torch.nn.functional.normalize(normals, dim=-1).float())
+    return SurfaceScan(scan, face, shares), turn
 
 
 def _scan(mesh: TriangleMesh, facing: Tensor, absent: Tensor | None, draw: Draw) -> SurfaceScan | None:

@@ -24,6 +24,8 @@ from ..matcher.rigs import people as drawn_people
 SHARD = 50
 # Share of the pairs that show rigs and people, not made-up kinds.
 _BODIES = 0.6
+# Share of the pairs that show all sides, as complete meshes do.
+_WHOLE = 0.25
 # Steps of a geodesic distance as it is stored, in one byte.
 _LEVELS = 255 / SIZES.farthest
 
@@ -135,7 +137,7 @@ def _make_shard(job: tuple[Path, int, int, bool, Path | None, int]) -> None:
 def _stream(seed: int, held_out: bool, rigs: Path | None, people: int) -> Iterator[MatchingPair]:
     drawn = drawn_people(Draw(torch.Generator().manual_seed(seed)), people) if people else []
     bodies = drawn_bodies(rigs, drawn, held_out=held_out)
-    return matching_pairs(seed, HELD_OUT_KINDS if held_out else TRAINING_KINDS, bodies=bodies, body_share=_BODIES)
+    return matching_pairs(seed, HELD_OUT_KINDS if held_out else TRAINING_KINDS, bodies=bodies, body_share=_BODIES, whole=_WHOLE)
 
 
 def stacked(batches: list[PairBatch]) -> PairBatch:
