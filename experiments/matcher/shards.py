@@ -137,7 +137,9 @@ def _make_shard(job: tuple[Path, int, int, bool, Path | None, int]) -> None:
 def _stream(seed: int, held_out: bool, rigs: Path | None, people: int) -> Iterator[MatchingPair]:
     drawn = drawn_people(Draw(torch.Generator().manual_seed(seed)), people) if people else []
     bodies = drawn_bodies(rigs, drawn, held_out=held_out)
-    return matching_pairs(seed, HELD_OUT_KINDS if held_out else TRAINING_KINDS, bodies=bodies, body_share=_BODIES, whole=_WHOLE)
+    return matching_pairs(
+        seed, HELD_OUT_KINDS if held_out else TRAINING_KINDS, bodies=bodies, body_share=_BODIES, whole=_WHOLE
+    )
 
 
 def stacked(batches: list[PairBatch]) -> PairBatch:

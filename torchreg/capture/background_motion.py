@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchreg.capture.depth import plane_normals
 from torchreg.capture.depth_frame import DepthFrame
-from torchreg.geometry.rigid import se3_exp, se3_log, transform_points
+from torchreg.geometry.rigid import invert_rigid, se3_exp, se3_log, transform_points
 from torchreg.solvers.robust import geman_mcclure_weight
 
 
@@ -40,18 +40,24 @@ def depth_noise(differences: Tensor) -> float:
 def background_motion(source: DepthFrame, target: DepthFrame) -> Tensor:
     """Return the rigid motion (4, 4) of the world, float64, that most of two pictures share; the identity if none does.
 
-    Projective point-to-plane ICP (Newcombe et al. 2011) from the pictures as they are, with a kernel that narrows to
-    the noise. The motion must be likelier than none by Schwarz's criterion.
+    Projective point-to-plane ICP (Newcombe et al. 2011) from the pictures as they are, from each to the other, with a
+    kernel that narrows to the noise. The better motion of both must be likelier than none by Schwarz's criterion.
     """
+    frames = (source, target), (target, source)
     still = torch.eye(4, dtype=torch.float64, device=source.depth.device)
-    motion, noise = still, _RULE.widest
+    motions, noises = [still, still], [_RULE.widest, _RULE.widest]
     # Normals come from windows as wide as the noise asks for, which is known only after a first fit.
     for _ in range(2):
-        pair = _Pair.of(source, target, noise)
-        motion, noise = pair.fitted(motion)
-    before = max(depth_noise(pair.linearized(still)[0]), _RULE.least)
-    likelier = _RULE.num_patches * math.log(before / noise) > 3 * math.log(_RULE.num_patches)
-    return motion if likelier else still
+        pairs = [_Pair.of(*both, noise) for both, noise in zip(frames, noises, strict=True)]
+        motions = [pair.fitted(motion) for pair, motion in zip(pairs, motions, strict=True)]
+        noises = [pair.noise(motion) for pair, motion in zip(pairs, motions, strict=True)]
+
+    def deviation(motion: Tensor) -> float:
+        return math.sqrt(pairs[0].noise(motion) * pairs[1].noise(invert_rigid(motion)))
+
+    best = min(motions[0], invert_rigid(motions[1]), key=deviation)
+    likelier = _RULE.num_patches * math.log(deviation(still) / deviation(best)) > 3 * math.log(_RULE.num_patches)
+    return best if likelier else still
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +88,12 @@ class _Pair:
         planes[row // step, column // step] = target.points.double()
         return cls(source.points.double(), target, planes, normals @ camera.world_to_camera[:3, :3])
 
-    def fitted(self, motion: Tensor) -> tuple[Tensor, float]:
-        """Return the motion (4, 4) that robust steps reach, and the noise at one metre."""
+    def noise(self, motion: Tensor) -> float:
+        """Return the standard deviation of distances to planes, at one metre."""
+        return max(depth_noise(self.linearized(motion)[0]), _RULE.least)
+
+    def fitted(self, motion: Tensor) -> Tensor:
+        """Return the motion (4, 4) that robust steps reach."""
         width = _RULE.widest
         for _ in range(_RULE.num_steps):
             residuals, rows = self.linearized(motion)
@@ -94,7 +104,7 @@ class _Pair:
             normal = weighted.mT @ rows + held * torch.eye(6).to(rows)
             gradient = weighted.mT @ residuals + held * se3_log(motion)
             motion = se3_exp(-torch.linalg.solve(normal, gradient)) @ motion
-        return motion, max(depth_noise(self.linearized(motion)[0]), _RULE.least)
+        return motion
 
     def linearized(self, motion: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances to planes (M',), at one metre, and their derivatives (M', 6) by the motion's twist."""
