@@ -1,7 +1,7 @@
 """How often the learnt matcher of scans is right, and what an alignment that keeps its matches makes of them.
 
 Pairs of kinds that the matcher never saw in training, and with --data those of its folder ``range_pairs`` and of the
-rigs of its folder ``library``, of eight kinds that are kept from training. By group:
+rigs of its folder ``library``, of eight kinds that are kept from training, from one side and from all. By group:
 
 - right: share of visible tokens whose best match lies within 5 % of the diagonal of the truth,
 - hidden: recall and precision of tokens called hidden, of all pairs together, where a probability of one half calls;
@@ -145,14 +145,14 @@ def held_out(count: int) -> Iterator[Pair]:
             yield Pair(name, found.source, found.target, found.source_truth)
 
 
-def rigs(folder: Path, count: int) -> Iterator[Pair]:
+def rigs(folder: Path, count: int, *, whole: bool = False) -> Iterator[Pair]:
     """Yield so many pairs of the rigs of kinds that are never trained on, their mean motions spread evenly."""
     with (folder / "index.csv").open(encoding="utf-8", newline="") as index:
         rows = [row for row in csv.DictReader(index) if row["kind"] in HELD_OUT_RIGS and row["torchreg"] == "ok"]
     for number, row in enumerate(itertools.islice(itertools.cycle(rows), count)):
         wanted = MOTION[0] + (MOTION[1] - MOTION[0]) * (number + 0.5) / count
         drawn = (row["kind"], body_of_rig(folder / row["file"]))
-        stream = matching_pairs(2000 + number, bodies=lambda _, drawn=drawn: drawn, body_share=1.0)
+        stream = matching_pairs(2000 + number, bodies=lambda _, drawn=drawn: drawn, body_share=1.0, whole=float(whole))
         pairs = [
             Pair(row["kind"], each.source, each.target, each.source_truth) for each in itertools.islice(stream, TRIES)
         ]
@@ -197,6 +197,9 @@ def main(arguments: list[str] | None = None) -> int:
     if (options.data / "library").is_dir():
         found_rigs = rigs(options.data / "library", 8 if options.smoke else 10 * options.pairs)
         print_rows([(pair.group, measured(pair, matcher)) for pair in found_rigs])
+        print("points of all sides:")
+        all_sides = rigs(options.data / "library", 8 if options.smoke else 2 * options.pairs, whole=True)
+        print_rows([(pair.group, measured(pair, matcher)) for pair in all_sides])
     return 0
 
 

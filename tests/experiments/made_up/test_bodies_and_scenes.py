@@ -206,17 +206,21 @@ def test_tips_of_plants_lie_on_the_surface_as_long_as_organs_live_and_organs_len
             assert heights[heights.isfinite()][-1] > heights[0]
 
 
-def test_the_truth_of_pairs_lies_on_the_other_scan_where_it_is_visible_and_leads_back():
-    for pair in itertools.islice(matching_pairs(0), 8):
+@pytest.mark.parametrize(("whole", "count", "least_visible"), [(0.0, 8, 0.25), (1.0, 3, 0.95)])
+def test_the_truth_of_pairs_lies_on_the_other_scan_where_it_is_visible_and_leads_back(whole, count, least_visible):
+    for pair in itertools.islice(matching_pairs(0, whole=whole), count):
         forth = pair.source_truth, pair.source_visible, pair.target
         for truth, visible, scan in (forth, (pair.target_truth, pair.target_visible, pair.source)):
             apart = torch.cdist(truth[visible], scan.points).amin(1) / scan.diagonal
             assert float(apart.max()) <= 0.03
             assert float(apart.median()) < 0.012
-        assert float(pair.source_visible.double().mean()) >= 0.25
+        assert float(pair.source_visible.double().mean()) >= least_visible
         nearest = torch.cdist(pair.source_truth[pair.source_visible], pair.target.points).argmin(1)
         back = (pair.target_truth[nearest] - pair.source.points[pair.source_visible]).norm(dim=-1)
         assert float(back.median()) < 0.02 * pair.source.diagonal
+
+
+def test_pairs_show_bodies_of_ones_own():
     limits = torch.tensor(TRAINING_KINDS["snake"][0](Draw(seeded(1))).limits, dtype=torch.float64)
     mine = ("mine", PosableBody(creature("snake"), limits))
     found = matching_pairs(2, bodies=lambda _: mine, body_share=1.0)
