@@ -60,12 +60,8 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
 def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
     """Return ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first."""
     coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
-    poses = problem.clamp_candidates(proposals.poses)
-    number = poses.shape[1]
-    wide = problem.repeated(number)
-    wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
-    matched = matched_pose(wide, proposals).reshape(poses.shape)
-    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(SEARCH_BUDGET.same, count)
+    pool = torch.cat([problem.clamp_candidates(proposals.poses), matched_pose(problem, proposals).unsqueeze(1)], dim=1)
+    fitted = Candidates.descended(coarse, pool, _PLAN).distinct(SEARCH_BUDGET.same, count)
     return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
 
 
@@ -81,19 +77,15 @@ def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignPro
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
-    """Return poses (B K, num_dofs) after an EM that matches data to model points near their places at rest.
+    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest.
 
-    Of B clouds the problem has K rows each. Pairs of a datum and a model point that rounding cannot tell from none are
-    left out: few are near each other.
+    Pairs of a datum and a model point that rounding cannot tell from none are left out: few are near each other.
     """
     skin, sigma, pose = problem.skin, _FIT.sigma * problem.size, problem.prior.mean
     near = torch.cdist(proposals.surface, skin.points).square()
     share = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1)
     share, index = share.topk(int((share > torch.finfo(share.dtype).eps).sum(-1).max()), sorted=False)
-    told, index, points = (
-        each.repeat_interleave(len(pose) // len(near), 0)
-        for each in (share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2))
-    )
+    told, index, points = share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2)
     for width in (None, *_FIT.reach):
         weight = told
         if width is not None:

@@ -26,6 +26,7 @@ class SearchBudget:
     num_compared: int = 60  # model points by which candidates are compared
     same: float = 0.05  # fitted poses whose points differ by less are one
     alike: float = 0.045  # the same of rough poses
+    duplicate: float = 0.005  # poses whose points differ by less descend to the same one
     max_ranked: int = 400  # best candidates, of which different ones are taken
     noise: float = 0.01  # standard deviation of the data for the weight of the prior
     cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
@@ -113,12 +114,17 @@ def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, T
 def _few_at_a_time(
     evaluate: Callable[[AlignProblem, Tensor], tuple[Tensor, Tensor]], problem: AlignProblem, poses: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return poses (B, K, num_dofs) and costs (B, K), evaluated for few candidates at a time."""
+    """Return poses (B, K, num_dofs) and costs (B, K), evaluated for few candidates at a time, duplicates once."""
+    close = mean_distances(problem, poses) <= SEARCH_BUDGET.duplicate * problem.size
+    original = first_close(close)
+    cloud, number = (original == torch.arange(poses.shape[1], device=poses.device)).nonzero(as_tuple=True)
     # The wrenches of all parts on all data are the largest table of a Jacobian.
-    pose, wrenches = poses.flatten(0, 1), 6 * problem.data.shape[1] * problem.skin.shape.num_parts
-    rows = rows_in_memory(len(pose), wrenches, pose.device)
-    found, costs = zip(*(evaluate(problem.rows(row // poses.shape[1]), pose[row]) for row in rows), strict=True)
-    return torch.cat(found).reshape(poses.shape), torch.cat(costs).reshape(poses.shape[:2])
+    wrenches = 6 * problem.data.shape[1] * problem.skin.shape.num_parts
+    found, costs = poses.clone(), torch.zeros_like(poses[..., 0])
+    for rows in rows_in_memory(len(cloud), wrenches, poses.device):
+        index = cloud[rows], number[rows]
+        found[index], costs[index] = evaluate(problem.rows(index[0]), poses[index])
+    return take_rows(found, original), costs.gather(1, original)
 
 
 def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
@@ -166,9 +172,15 @@ def take_rows(table: Tensor, index: Tensor) -> Tensor:
     return table.gather(1, index.reshape(*index.shape, *[1] * (table.ndim - 2)).expand(*index.shape, *table.shape[2:]))
 
 
-def distinct_first(close: Tensor) -> Tensor:
-    """Return the order (B, K) that moves items to the end that are close (B, K, K) to an item kept before them."""
+def first_close(close: Tensor) -> Tensor:
+    """Return for each item (B, K) which item it is close (B, K, K) to of those before it that are kept, or itself."""
     kept = torch.ones_like(close[..., 0])
     for rank in range(1, close.shape[-1]):
         kept[:, rank] = ~(close[:, rank, :rank] & kept[:, :rank]).any(-1)
-    return kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)
+    return (close & kept.unsqueeze(1)).to(torch.uint8).argmax(-1)
+
+
+def distinct_first(close: Tensor) -> Tensor:
+    """Return the order (B, K) that moves items to the end that are close (B, K, K) to an item kept before them."""
+    is_later = first_close(close) != torch.arange(close.shape[-1], device=close.device)
+    return is_later.to(torch.uint8).argsort(dim=1, stable=True)

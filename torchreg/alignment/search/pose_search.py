@@ -29,7 +29,6 @@ class _Stage:
 class _Search:
     """Numbers of the search; lengths are shares of the model's size."""
 
-    same: float = 0.005  # candidates whose points differ by less are duplicates
     min_gain: float = 0.5  # in data explained: a round that gains less is the last
 
 
@@ -79,11 +78,11 @@ class PoseSearch:
     def fit_coarsely(self, pool: Tensor, steps: int) -> Tensor:
         """Return candidates (B, N, num_dofs) after surface fits of narrowing kernels, best and different ones first."""
         fitted = Candidates.descended(self.coarse_problem, pool, replace(_COARSE, steps=steps))
-        return fitted.distinct(_SEARCH.same).poses
+        return fitted.distinct(SEARCH_BUDGET.duplicate).poses
 
     def prune(self, pool: Tensor, count: int) -> Tensor:
         """Return the best, different ``count`` of candidates (B, N, num_dofs), limbs placed anew or as given."""
-        return self._best_options(self.coarse_problem, pool, _PRUNE, 0).distinct(_SEARCH.same, count).poses
+        return self._best_options(self.coarse_problem, pool, _PRUNE, 0).distinct(SEARCH_BUDGET.duplicate, count).poses
 
     def refine(self, candidates: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
         """Return candidates (B, H, num_dofs) after a thorough search, best first, and their scores (B, H)."""
