@@ -67,7 +67,7 @@ def fit_surface(
     noise = surface_noise(distance, problem.valid, problem.size)
     sigma = SURFACE_FIT.width_per_noise * noise
     objective = surface_objective(problem, sigma, noise)
-    solved = problem.solve(objective, pose, steps, objective.linearize(pose, distance, jacobian))
+    solved = problem.solve(objective, pose, steps, objective(pose, distance, jacobian))
     for _ in range(SURFACE_FIT.last_steps - 1):
         # Poses that are final take no more steps; one without an accepted step is not.
         active = ~((solved.last_step != 0).any(-1) & (problem.change(solved.last_step) <= problem.pose_atol))
@@ -115,7 +115,7 @@ def refine_surface(problem: AlignProblem, pose: Tensor, *, steps: int, widths: S
     noise = surface_noise(distance, problem.valid, problem.size)
     objective = surface_objective(problem, SURFACE_FIT.width_per_noise * noise, noise)
     for _ in range(SURFACE_FIT.last_steps * steps):
-        around = objective.linearize(pose, distance, jacobian)
+        around = objective(pose, distance, jacobian)
         solved = problem.step(around, pose, SURFACE_FIT.refine_damping)
         pose = solved.state
         distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)

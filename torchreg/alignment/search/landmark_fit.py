@@ -177,7 +177,7 @@ def _all_around(problem: AlignProblem) -> Tensor:
 def _objective(wide: AlignProblem, width: float) -> Objective:
     """Return the likelihood of the keypoints and the prior, at a width in metres."""
     sigma = torch.full_like(wide.prior.mean[:, 0], width)
-    return Objective(None, wide.factors, wide.prior, sigma, sigma)
+    return Objective((*wide.factors, wide.prior), sigma, sigma)
 
 
 def _descended(problem: AlignProblem, pool: Tensor, widths: tuple[float, ...]) -> Tensor:
