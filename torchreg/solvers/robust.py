@@ -53,13 +53,13 @@ def cauchy_loss(squared_ratio: Tensor) -> Tensor:
 
 
 def welsch_cost(residual: Tensor, weights: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
-    """Return ``sum_j w_j s^2 rho(r_j^2 / s^2) / 2 n^2`` (...) of residuals (..., M), kernel widths s and noises n (...)."""
+    """Return ``sum_j w_j s^2 rho(r_j^2 / s^2) / 2 n^2`` of residuals (..., M), kernel widths s and noises n (...)."""
     loss = weights * welsch_loss((residual / sigma.unsqueeze(-1)).square())
     return 0.5 * (sigma / noise).square() * loss.sum(-1)
 
 
 def welsch_system(residual: Tensor, jacobian: Tensor, weights: Tensor, sigma: Tensor, noise: Tensor) -> Linearization:
-    """Return the `welsch_cost` of residuals (..., M) with a Jacobian (..., M, D), and its Gauss-Newton approximation."""
+    """Return the `welsch_cost` of residuals (..., M) with a Jacobian (..., M, D), and its Gauss-Newton system."""
     beta = welsch_weight((residual / sigma.unsqueeze(-1)).square())
     weighted = jacobian * (weights * beta / noise.square().unsqueeze(-1)).unsqueeze(-1)
     cost = 0.5 * (sigma / noise).square() * (weights * (1 - beta)).sum(-1)

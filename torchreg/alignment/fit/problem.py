@@ -20,13 +20,8 @@ from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.shaped import ShapedSkin
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
-from torchreg.solvers.levenberg_marquardt import (
-    Linearization,
-    LMResult,
-    damped_step,
-    held_at_limits,
-    levenberg_marquardt,
-)
+from torchreg.solvers.arrow import SharedRows
+from torchreg.solvers.levenberg_marquardt import Linearization, LMResult
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 OneFactor = TypeVar("OneFactor", bound=Factor)
@@ -60,7 +55,7 @@ class AlignProblem:
 
     Data (B, M, 3) in metres from the origins (B, 3); `size`, the diagonal of the model at rest, is the unit of all
     thresholds; `debias` is the share of the kernel's shrinkage that is corrected in the targets of the EM; normals (B,
-    M, 3) of the data count in the EM.
+    M, 3) of the data count in the EM. Successive rows, `scans` each, share coefficients.
     """
 
     skin: LinearBlendSkin
@@ -79,6 +74,7 @@ class AlignProblem:
     factors: tuple[Factor, ...] = ()
     prior_precision: Tensor | None = None
     normals: Tensor | None = None
+    scans: int = 1
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -147,18 +143,24 @@ class AlignProblem:
         self, objective: Objective, pose: Tensor, max_steps: int, around: Linearization, damping: Tensor | None = None
     ) -> LMResult:
         """Return the result of Levenberg-Marquardt within the joint limits from a pose with a known linearization."""
-        return levenberg_marquardt(
-            objective, pose, retract=self.skin.shape.retract, lower=self.lower, upper=self.upper,
-            damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
-            start=around, cost=objective.cost,
+        return self.shared.descend(
+            objective, pose, lower=self.lower, upper=self.upper, damping=damping, max_steps=max_steps,
+            atol=self.pose_atol * min(1.0, self.size), start=around, cost=objective.cost,
         )  # fmt: skip
 
     def step(self, around: Linearization, pose: Tensor, damping: float = 1e-3) -> LMResult:
         """Return the result of one damped step without a test: all that a generalized EM needs."""
-        shares = torch.full_like(pose[:, 0], damping)
-        frozen = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step, _ = damped_step(around, shares, frozen=frozen)
-        return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, shares, step, 1)
+        return self.shared.step(around, pose, lower=self.lower, upper=self.upper, damping=damping)
+
+    @property
+    def shared(self) -> SharedRows:
+        """Which unknowns the rows share: none, one by one."""
+        return SharedRows(self.skin.shape.retract)
+
+    def unfinished(self, step: Tensor) -> Tensor:
+        """Return the rows (R,) whose last step (B, num_dofs) was not final, or none, with those that share unknowns."""
+        moves = ~((step != 0).any(-1) & (self.change(step) <= self.pose_atol))
+        return moves.unflatten(0, (-1, self.scans)).any(-1).repeat_interleave(self.scans).nonzero()[:, 0]
 
     def change(self, step: Tensor) -> Tensor:
         """Return the largest change (B,) in a step, radians, or metres as a share of the size."""

@@ -69,11 +69,10 @@ def fit_surface(
     objective = surface_objective(problem, sigma, noise)
     solved = problem.solve(objective, pose, steps, objective(pose, distance, jacobian))
     for _ in range(SURFACE_FIT.last_steps - 1):
-        # Poses that are final take no more steps; one without an accepted step is not.
-        active = ~((solved.last_step != 0).any(-1) & (problem.change(solved.last_step) <= problem.pose_atol))
-        if not bool(active.any()):
+        index = problem.unfinished(solved.last_step)
+        if len(index) == 0:
             break
-        solved = _solve_rows(problem, solved, active.nonzero()[:, 0], sigma, noise, steps)
+        solved = _solve_rows(problem, solved, index, sigma, noise, steps)
     report_step(on_step, problem, solved, stage="surface", step=len(widths), num_steps=num_steps, sigma=sigma)
     return StageResult(pose=solved.state, sigma=sigma, change=problem.change(solved.last_step))
 
