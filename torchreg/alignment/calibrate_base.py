@@ -135,7 +135,7 @@ def _wrong_joints(shape: ArticulatedShape, fit: BaseFit) -> list[bool]:
     """Return of each frame of a fit whether other joints explain more of its data, compared with the other frames."""
     surface = fit.problem.surface
     thinned = [frame.thinned(_NUMBERS.num_moved) for frame in fit.problem.frames]
-    bases = base_of(fit.problem.poses(fit.state)[:, :BASE_DOFS].double())
+    bases = base_of(fit.problem.poses(fit.state))
     rows = [
         transform_points(invert_rigid(base), frame.points).to(shape.rest)
         for base, frame in zip(bases, thinned, strict=True)
@@ -179,7 +179,7 @@ def _result(
     is_sole: bool,
 ) -> BaseCalibration:
     everything = replace(fit.problem, frames=tuple(frames))
-    residuals = torch.stack([row.abs().median() for row in everything.residuals(fit.state)])
+    residuals = everything.residuals(fit.state).abs().nanmedian(-1).values
     status = Status.CONVERGED if fit.converged else Status.MAX_STEPS
     if outliers or not is_sole:
         status = Status.WITH_WARNINGS
