@@ -226,7 +226,7 @@ def _fit_jointly(
         is_last = step == len(widths)
         noise = problem.noise(state) if is_last else SURFACE_FIT.max_noise(problem.size)
         sigma = SURFACE_FIT.width_per_noise * noise if is_last else widths[step] * problem.size
-        max_steps = config.steps * (SCALE_FIT.last_steps if is_last else 1)
+        max_steps = config.steps * (SURFACE_FIT.last_steps if is_last else 1)
         atol = config.align.pose_atol * min(1.0, problem.size)
         solved = problem.solve(state, sigma, SCALE_FIT.shared_error * noise, max_steps, atol)
         state, cost = solved.state, solved.cost[0]

@@ -47,8 +47,6 @@ class _Candidates:
     """Numbers of the candidates."""
 
     typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
-    fit_steps: int = 3  # at each width of the coarse fit
-    proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
 
 
 _CANDIDATES = _Candidates()
@@ -77,7 +75,7 @@ class FindPoseConfig:
     search_rounds: int = 2
     num_retries: int = 0
     prior_std: float | None = 0.4
-    num_model_points: int = 500
+    num_model_points: int = AlignConfig.num_model_points
     nan_policy: str = "raise"
     upright: Direction | None = None
     seed: int = 0
@@ -219,7 +217,7 @@ def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
 ) -> Candidates:
     """Return candidates (B, H): a network's, and a search's if in doubt."""
-    problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
+    problem, proposed = source.proposed(problem, config.num_searched)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
     found = Candidates.fitted(problem, proposed)
@@ -260,11 +258,11 @@ def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, 
     rough = source.rough(search.problem, generator)
     ranked = Candidates.ranked(search.problem, *register_rigidly(search.problem, rough, generator))
     if isinstance(problem.surface, SkinSurface):
-        rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.alike, config.num_placed).poses], dim=1)
+        rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.same, config.num_placed).poses], dim=1)
         aligned = align_rows(problem, rough, config.num_searched, generator)
         return Candidates.fitted(problem, aligned)
-    rough = ranked.distinct(SEARCH_BUDGET.alike, config.num_candidates).poses
-    pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
+    rough = ranked.distinct(SEARCH_BUDGET.same, config.num_candidates).poses
+    pool = search.fit_coarsely(rough)[:, : config.num_placed]
     pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
     return Candidates.fitted(problem, poses)

@@ -30,7 +30,8 @@ from torchreg.solvers.robust import welsch_system
 class BaseFitNumbers:
     """Numbers of the fit of a base; lengths are shares of the model's size."""
 
-    widths: tuple[float, ...] = (0.09, 0.05, 0.03)  # of the kernel before the last one, which follows from the noise
+    start: float = 0.09  # first kernel
+    stop: float = 0.03  # of the kernel before the last one, which follows from the noise
     steps: int = 3  # at each of them
     last_steps: int = 20  # of each round at the last one, at most
     rounds: int = 8  # at the last one, at most
@@ -226,7 +227,7 @@ def base_of(state: Tensor) -> Tensor:
     return rigid_matrix(so3_exp(state[:, 3:BASE_DOFS]), state[:, :3])
 
 
-def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> BaseFit:
+def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float]) -> BaseFit:
     """Return the state after a fit with kernels of some widths, shares of the size, and one that follows the noise."""
     state = approach_base(problem, state, widths)
     residual = problem.residuals(state).flatten()
@@ -240,7 +241,7 @@ def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE
     return BaseFit(problem=problem, state=state, sigma=sigma, noise=noise, converged=converged)
 
 
-def approach_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> Tensor:
+def approach_base(problem: BaseProblem, state: Tensor, widths: Sequence[float]) -> Tensor:
     """Return the state after a few steps with a kernel of each of some widths, shares of the size."""
     noise = SURFACE_FIT.max_noise(problem.size)
     for width in widths:
@@ -280,4 +281,4 @@ def fit_offsets(fit: BaseFit) -> BaseFit:
         free[worst] = False
     state = fit.state.clone()
     state[0, _OFFSETS:] = torch.where(free, found.state[0, _OFFSETS:], 0.0)
-    return fit_base(replace(problem, free=free), state, widths=BASE_FIT.widths[-1:])
+    return fit_base(replace(problem, free=free), state, widths=(BASE_FIT.stop,))

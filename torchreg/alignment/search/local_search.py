@@ -47,7 +47,6 @@ class _Scatter:
 class _Around:
     """Numbers of the search all around a start."""
 
-    fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
 
@@ -121,7 +120,7 @@ def _search_around(
         _scatter(search.problem, search.limbs.limbs, center, max(1, candidates // 2), generator)
         for center in (start, best)
     ]
-    pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1), _AROUND.fit_steps)
+    pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1))
     placed = search.prune(pool[:, : max(1, round(_AROUND.placed_share * pool.shape[1]))], _AROUND.num_refined)
     poses, scores = search.refine(placed[:, :1], rounds)
     found, value = poses[:, 0], scores[:, 0]

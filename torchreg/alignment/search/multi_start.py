@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, alignment_cost
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface_steps
 from torchreg.solvers.robust import welsch_loss
 
@@ -23,9 +24,7 @@ class SearchBudget:
     num_data: int = 800  # of the refinement: more tell candidates apart no better
     num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
     num_model_points: int = 120  # that cover the shape
-    num_compared: int = 60  # model points by which candidates are compared
-    same: float = 0.05  # fitted poses whose points differ by less are one
-    alike: float = 0.045  # the same of rough poses
+    same: float = 0.05  # poses whose points differ by less are one
     duplicate: float = 0.005  # poses whose points differ by less descend to the same one
     max_ranked: int = 400  # best candidates, of which different ones are taken
     noise: float = 0.01  # standard deviation of the data for the weight of the prior
@@ -38,11 +37,11 @@ SEARCH_BUDGET = SearchBudget()
 
 @dataclass(frozen=True)
 class Plan:
-    """Damped steps at each of some kernel widths, then a score at one width, all shares of the model's size."""
+    """Damped steps at each of narrowing kernel widths, then a score at the last, all shares of the model's size."""
 
-    widths: tuple[float, ...]
+    start: float
+    stop: float
     steps: int
-    score_width: float = 0.022
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +103,9 @@ def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, T
 
     def descent(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
         noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
-        for width in plan.widths:
+        for width in narrowing(plan.start, plan.stop):
             pose = surface_steps(part, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
-        return pose, score_candidates(part, pose.unsqueeze(1), plan.score_width)[:, 0]
+        return pose, score_candidates(part, pose.unsqueeze(1), plan.stop)[:, 0]
 
     return _few_at_a_time(descent, problem, poses)
 
@@ -151,13 +150,13 @@ def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torc
         pose = fit_surface(part, pose, steps=settings.surface_steps).pose
         costs = alignment_cost(part, pose).unflatten(0, (-1, candidates))
         ranked = Candidates.ranked(drawn.rows(rows), pose.unflatten(0, (-1, candidates)), costs)
-        found.append(ranked.distinct(SEARCH_BUDGET.alike, count).poses)
+        found.append(ranked.distinct(SEARCH_BUDGET.same, count).poses)
     return torch.cat(found)
 
 
 def mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
     """Return the distances (B, K, K) of model points, as root mean squares, between poses (B, K, num_dofs)."""
-    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_compared), :]
+    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_model_points), :]
     return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
 
 

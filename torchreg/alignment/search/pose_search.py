@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.search.limb_search import Effort, LimbSearch
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, descend, take_rows
 from torchreg.geometry.sampling import farthest_points
@@ -37,16 +38,16 @@ _PRUNE = _Stage(
         num_data=150, width=0.05, beam=82, configurations=41, refine_widths=(), score_width=0.05, combinations=2,
         exchanged=0,
     ),
-    plan=Plan(widths=(0.04, 0.03, 0.025), steps=1),
+    plan=Plan(start=0.04, stop=0.022, steps=1),
 )  # fmt: skip
 _REFINE = _Stage(
     effort=Effort(
-        num_data=250, width=0.05, beam=123, configurations=40, refine_widths=_PRUNE.plan.widths, score_width=0.02,
+        num_data=250, width=0.05, beam=123, configurations=40, refine_widths=narrowing(0.04, 0.022), score_width=0.02,
         combinations=8, exchanged=3,
     ),
-    plan=Plan(widths=(0.03, 0.022, 0.018), steps=2, score_width=0.018),
+    plan=Plan(start=0.03, stop=0.018, steps=2),
 )  # fmt: skip
-_COARSE = Plan(widths=(0.12, 0.08, 0.05, 0.03, 0.018), steps=3)
+_COARSE = Plan(start=0.12, stop=0.018, steps=3)
 _SEARCH = _Search()
 
 
@@ -75,9 +76,9 @@ class PoseSearch:
         """Return the scores (B,) of poses (B, num_dofs) after a fit without any search, comparable to `refine`'s."""
         return descend(self.problem, poses.unsqueeze(1), _REFINE.plan)[1][:, 0]
 
-    def fit_coarsely(self, pool: Tensor, steps: int) -> Tensor:
+    def fit_coarsely(self, pool: Tensor) -> Tensor:
         """Return candidates (B, N, num_dofs) after surface fits of narrowing kernels, best and different ones first."""
-        fitted = Candidates.descended(self.coarse_problem, pool, replace(_COARSE, steps=steps))
+        fitted = Candidates.descended(self.coarse_problem, pool, _COARSE)
         return fitted.distinct(SEARCH_BUDGET.duplicate).poses
 
     def prune(self, pool: Tensor, count: int) -> Tensor:

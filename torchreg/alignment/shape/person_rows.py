@@ -198,7 +198,7 @@ class PersonRows:
         space, dofs = self.task.shape.coefficient_space(), self.task.shape.num_dofs
         member = alike.unsqueeze(-1) == alike.clamp_min(0).unique()
         group = member.to(state)
-        for _ in range(SHAPE_FIT.spread_steps):
+        for _ in range(SHAPE_FIT.fine_steps):
             precision = problem.prior.precision[dofs:] * problem.scans
             covariance = shared_covariance(noise_covariance(problem, state), dofs)
             told = (1 - covariance.diagonal() * precision).clamp(0, 1)

@@ -14,6 +14,7 @@ from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.search.limb_search import joint_samples
 from torchreg.alignment.search.multi_start import Candidates
 from torchreg.alignment.search.rough_poses import (
+    UniformRotations,
     UprightRotations,
     closeness,
     register_rigidly,
@@ -33,7 +34,6 @@ from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 class _PersonSearch:
     """Numbers of the search."""
 
-    num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
     duplicate_limb_rms: float = 0.03  # the same, of states that differ in one limb only
     turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
@@ -58,7 +58,7 @@ def find_people(
     Coefficients (S, K) in evenly spread or upright rotations are registered rigidly, and ranked by unexplained data and
     surface.
     """
-    turns = spread_rotations(_SEARCH.num_rotations) if upright is None else UprightRotations(upright).rotations(rig.up)
+    turns = spread_rotations(UniformRotations.count) if upright is None else UprightRotations(upright).rotations(rig.up)
     rotations = so3_log(turns).to(people)
     joints = typical_poses(rig)
     grid = (len(people), len(joints), len(rotations))

@@ -24,7 +24,6 @@ class ScaleFit:
     """Numbers of a joint fit."""
 
     shared_error: float = 1.5  # factor on the noise: neighboring residuals share the error of the shape's surface
-    last_steps: int = 2  # at the last width, as a multiple of those at the others
 
 
 SCALE_FIT = ScaleFit()

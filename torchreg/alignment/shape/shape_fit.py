@@ -50,7 +50,6 @@ class ShapeFit:
     coarse_steps: int = 3  # at each width of the surface fit
     fine_steps: int = 4
     em_steps: int = 6  # values of sigma
-    spread_steps: int = 4  # after which a learned deviation of coefficients hardly changes
     num_swung: int = 2  # people with a limb swung who are fitted: the first was right in all that were looked at
     again: float = 0.06  # first sigma of the second annealing, as a share of the size
 
