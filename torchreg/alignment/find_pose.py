@@ -30,7 +30,7 @@ from torchreg.alignment.search.landmark_fit import KeypointRows, find_keypoints
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, align_rows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.pose_search import PoseSearch
-from torchreg.alignment.search.rough_poses import PoseSource, bent_pose, register_rigidly
+from torchreg.alignment.search.rough_poses import PoseSource, register_rigidly, typical_poses
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
@@ -40,16 +40,6 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import SkinSurface
-
-
-@dataclass(frozen=True)
-class _Candidates:
-    """Numbers of the candidates."""
-
-    typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
-
-
-_CANDIDATES = _Candidates()
 
 
 @dataclass(frozen=True)
@@ -177,7 +167,7 @@ def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> Fo
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
         origin = masked_mean(batch, batch_valid)
-        typical = shifted(bent_pose(shape, _CANDIDATES.typical).expand(len(batch), -1), origin)
+        typical = shifted(typical_poses(shape).mean(0).expand(len(batch), -1), origin)
         problem = centered_problem(
             task.skin(), batch, batch_valid, typical, origin, prior_std=config.prior_std,
             pose_atol=task.config.pose_atol, free_space=seen.free_space, keypoints=seen.keypoints,

@@ -37,7 +37,6 @@ class RecoveryPlan:
     occluded: float = 0.6  # of the mean inliers missing from the mean number of data: the shape is probably occluded
     num_searched: int = 2  # known poses whose limbs are placed thoroughly
     max_data: int = 3000  # of a search everywhere: more tell no more
-    num_proposed: int = 3  # poses of a network that are fitted, different ones
     equivalent: float = 0.03  # share of the data that a pose explains less than the best and still counts as good
     max_motion: float = 0.4  # of the base from its prediction per interval: on little data much seems to fit
     max_repetitions: int = 3  # of the first search everywhere, with other draws: nothing is known yet
@@ -140,8 +139,8 @@ class Recovery:
             self.fitter.skin, data[None], valid, state.pose[None], origin[None], prior_std=FindPoseConfig.prior_std,
             pose_atol=0.0,
         )  # fmt: skip
-        _, poses = self.source.proposed(problem, _PLAN.num_proposed)
-        fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0]]
+        _, poses = self.source.proposed(problem, FindPoseConfig.num_searched)
+        fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0].unique(dim=0)]
         return max((fit for fit in fits if fit is not None), key=lambda fit: fit.soft_inliers, default=None)
 
     def _first(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:

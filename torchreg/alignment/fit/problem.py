@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -76,7 +76,7 @@ class AlignProblem:
     normals: Tensor | None = None
     scans: int = 1
 
-    def rows(self, index: Tensor) -> AlignProblem:
+    def rows(self, index: Tensor) -> Self:
         """Return the problems of some rows of the batch, which may repeat."""
         return replace(
             self,
@@ -91,23 +91,28 @@ class AlignProblem:
             normals=None if self.normals is None else self.normals[index],
         )
 
-    def repeated(self, count: int) -> AlignProblem:
+    def repeated(self, count: int) -> Self:
         """Return the batch with every problem ``count`` times in a row."""
         return self.rows(torch.arange(len(self.data), device=self.data.device).repeat_interleave(count))
 
-    def draw(self, count: int, generator: torch.Generator) -> AlignProblem:
+    def draw(self, count: int, generator: torch.Generator) -> Self:
         """Return the problem with at most ``count`` data, drawn from the valid ones, the same alone and in a batch."""
         draw = torch.rand(self.valid.shape[-1], generator=generator, dtype=torch.float32).to(self.data)
         keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
-        data = self.data.gather(1, keep.unsqueeze(-1).expand(*keep.shape, 3))
-        return self.with_data(data, self.valid.gather(1, keep))
+        return self.kept(keep)
 
-    def with_data(self, data: Tensor, valid: Tensor) -> AlignProblem:
+    def kept(self, index: Tensor) -> Self:
+        """Return the problem with the data (B, C) of an index, that stand for all."""
+        wide = index.unsqueeze(-1).expand(*index.shape, 3)
+        found = self.with_data(self.data.gather(1, wide), self.valid.gather(1, index))
+        return found if self.normals is None else replace(found, normals=self.normals.gather(1, wide))
+
+    def with_data(self, data: Tensor, valid: Tensor) -> Self:
         """Return the problem with a sample of its data (B, M, 3), valid or not (B, M), that stands for all."""
         thinning = self.valid.sum(-1) / valid.sum(-1).clamp_min(1)
         return replace(self, data=data, valid=valid, factors=tuple(each.thinned(thinning) for each in self.factors))
 
-    def with_skin(self, skin: LinearBlendSkin) -> AlignProblem:
+    def with_skin(self, skin: LinearBlendSkin) -> Self:
         """Return the problem with other model points that cover the shape as evenly."""
         return replace(self, skin=skin, factors=tuple(factor.for_skin(skin) for factor in self.factors))
 

@@ -18,7 +18,7 @@ from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates
-from torchreg.alignment.search.rough_poses import UniformRotations, bent_pose, typical_poses
+from torchreg.alignment.search.rough_poses import UniformRotations, typical_poses
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_log, spread_rotations
 from torchreg.result import Status, normal_copy
@@ -71,7 +71,7 @@ class KeypointRows:
             raise InputError(f"keypoints alone must be of one frame, (K, 2) or (K, 3), got {got}")
         shape = skin.shape
         origin = _center(shape, measured)[None]
-        near = bent_pose(shape, 0.5) if start is None else start[0]
+        near = typical_poses(shape).mean(0) if start is None else start[0]
         problem = centered_problem(
             skin, origin.unsqueeze(1), torch.zeros_like(origin[:, :1], dtype=torch.bool), near[None], origin,
             prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
@@ -159,7 +159,7 @@ def _center(shape: Articulation, measured: MeasuredKeypoints) -> Tensor:
     middle = targets.median(0).values
     if measured.camera is None:
         return middle.to(shape.rest)
-    points = shape.keypoints(bent_pose(shape, 0.5)).double()
+    points = shape.keypoints(typical_poses(shape).mean(0)).double()
     spread = (points - points.median(0).values).norm(dim=-1).median()
     seen = (targets - middle).norm(dim=-1).median().clamp_min(1.0)
     depth = measured.camera.intrinsics[:2].mean().double() * spread / seen

@@ -39,8 +39,7 @@ class _Scatter:
     turn: float = 0.17  # of the base, radians
     shift: float = 0.035  # of the base, as a share of the model's size
     redrawn_limbs: float = 0.25  # share of the limbs that are drawn uniformly
-    redrawn_reach: float = 1.2  # of the joints of such a limb from the pose, radians or metres
-    known_reach: float = 3.0  # standard deviations of what is known beforehand, for those joints: beyond lies 1 in 400
+    reach: float = 3.0  # standard deviations of the joints of such a limb, at most: beyond lies 1 in 400
 
 
 @dataclass(frozen=True)
@@ -144,9 +143,10 @@ def _scatter(
     noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
     around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)
-    lower, upper = problem.plausible_limits(_SCATTER.known_reach)
-    span = (upper - lower).clamp_max(2 * _SCATTER.redrawn_reach)
-    low = torch.minimum(torch.maximum(center - _SCATTER.redrawn_reach, lower), upper - span)
+    lower, upper = problem.plausible_limits(_SCATTER.reach)
+    reach = _SCATTER.reach * _SCATTER.max_joints
+    span = (upper - lower).clamp_max(2 * reach)
+    low = torch.minimum(torch.maximum(center - reach, lower), upper - span)
     redrawn = low.unsqueeze(1) + span.unsqueeze(1) * torch.rand(
         noise.shape, generator=generator, dtype=torch.float32
     ).to(center)

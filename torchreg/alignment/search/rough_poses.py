@@ -110,13 +110,9 @@ DEFAULT_SOURCES: tuple[PoseSource, ...] = (UniformRotations(), PrincipalAxes())
 
 def typical_poses(shape: Articulation) -> Tensor:
     """Return (K, num_dofs) different poses between the rest pose and the middle of the joint limits."""
-    return torch.stack([bent_pose(shape, share) for share in _BENT_SHARES]).unique(dim=0)
-
-
-def bent_pose(shape: Articulation, share: float) -> Tensor:
-    """Return the pose (num_dofs,) at a share of the way from the rest pose to the middle of the joint limits."""
     middle = 0.5 * (shape.lower + shape.upper)
-    return shape.rest + share * torch.where(middle.isfinite(), middle - shape.rest, 0.0)
+    way = torch.where(middle.isfinite(), middle - shape.rest, 0.0)
+    return torch.stack([shape.rest + share * way for share in _BENT_SHARES]).unique(dim=0)
 
 
 def _principal_axes(points: Tensor, weights: Tensor) -> Tensor:

@@ -186,7 +186,7 @@ def _found(
     problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator, upright: Direction | None
 ) -> tuple[ShapeProblem, Tensor]:
     """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
-    one = problem.rows(torch.zeros(1, dtype=torch.int64)).sample(SHAPE_FIT.coarse_data, generator)
+    one = problem.rows(torch.zeros(1, dtype=torch.int64)).draw(SHAPE_FIT.coarse_data, generator)
     states = find_people(one, rig, people, SHAPE_FIT.num_found, generator, upright)
     return problem.rows(torch.zeros(len(states), dtype=torch.int64)), states
 

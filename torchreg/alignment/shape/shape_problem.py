@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -20,9 +21,9 @@ class ShapeProblem(AlignProblem):
     skin: ShapedSkin  # type: ignore[assignment]
     surface: ShapedSurface
 
-    def rows(self, index: Tensor) -> ShapeProblem:
+    def rows(self, index: Tensor) -> Self:
         """Return the problems of some rows of the batch."""
-        chosen: ShapeProblem = super().rows(index)  # type: ignore[assignment]
+        chosen = super().rows(index)
         return replace(chosen, surface=self.surface.with_normals(chosen.data_normals()))
 
     def people(self, index: Tensor) -> Tensor:
@@ -33,17 +34,10 @@ class ShapeProblem(AlignProblem):
         """Return the normals (B, M, 3) of the data."""
         return torch.zeros_like(self.data) if self.normals is None else self.normals
 
-    def sample(self, count: int, generator: torch.Generator) -> ShapeProblem:
-        """Return the problem with at most so many data of every scan, the same for all people."""
-        draw = torch.rand(self.scans, self.valid.shape[1], generator=generator).to(self.data)
-        draw = draw.repeat(len(self.data) // self.scans, 1)
-        keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
-        index = keep.unsqueeze(-1).expand(*keep.shape, 3)
-        normals = self.data_normals().gather(1, index)
-        return replace(
-            self, data=self.data.gather(1, index), valid=self.valid.gather(1, keep), normals=normals,
-            surface=self.surface.with_normals(normals),
-        )  # fmt: skip
+    def kept(self, index: Tensor) -> Self:
+        """Return the problem with the data (B, C) of an index, that stand for all."""
+        chosen = super().kept(index)
+        return replace(chosen, surface=self.surface.with_normals(chosen.data_normals()))
 
     def cost_of_people(self, state: Tensor) -> Tensor:
         """Return the cost (S,) by which people are ranked."""
