@@ -94,13 +94,13 @@ def test_the_registration_gradient_is_that_of_the_data_likelihood(skin):
 
 def test_the_surface_fit_is_equations_21_and_22(links, surface_fit):
     """As the Welsch function, whose weights are beta."""
-    pose, data, found = poses(), surface_fit.data.data, surface_fit(poses())
+    pose, data, found = poses(), surface_fit.terms[0].data, surface_fit(poses())
     for row, (count, sigma, noise) in enumerate(((50, 0.02, 0.004), (30, 0.04, 0.008))):
         distances = links.distance(data[row, :count], pose[row])
         expected = sum(sigma**2 * (1 - float((-(d**2) / sigma**2).exp())) / (2 * noise**2) for d in distances)
         assert float(found.cost[row]) == pytest.approx(expected + prior_cost(row), rel=1e-10)
     jacobian = differences(links, lambda trial: links.distance(data, trial), pose, 1e-6)
-    beta = (-(links.distance(data, pose) / WIDTHS[:, None]).square()).exp() * surface_fit.data.valid
+    beta = (-(links.distance(data, pose) / WIDTHS[:, None]).square()).exp() * surface_fit.terms[0].valid
     # The base is damped by a tenth of one datum: per metre, and per radian at a lever of one metre.
     damping = torch.cat([torch.full((6,), 0.1), torch.zeros(2)]).double() / WIDTHS.square().unsqueeze(-1)
     weights = (beta / NOISE[:, None].square()).unsqueeze(-1)
@@ -120,7 +120,7 @@ def test_gradients_and_costs_alone_are_those_of_the_cost(links, request, name, s
 def test_the_prior_is_a_gaussian_on_every_problem_and_candidate(prior):
     pose, precision = poses(), prior.precision.expand(2, 8)
     ones = Linearization(torch.ones(2).double(), torch.ones(2, 8).double(), torch.ones(2, 8, 8).double())
-    found, offsets = prior.add_to(ones, pose), pose - prior.mean
+    found, offsets = ones.plus(prior.linearized(pose)), pose - prior.mean
     torch.testing.assert_close(found.cost, 1 + (precision * offsets**2).sum(-1) / 2)
     torch.testing.assert_close(found.gradient, 1 + precision * offsets)
     torch.testing.assert_close(found.hessian, 1 + torch.diag_embed(precision))

@@ -4,7 +4,7 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 
 - the problem: `AlignProblem`, `centered_problem`, `alignment_cost`, `GaussianPosePrior`, `joint_precision`,
   `model_size`; least squares: `Objective`, `surface_objective`;
-- the annealed EM: `anneal`, `outlier_level`;
+- the annealed EM: `anneal`, `narrowing`, `outlier_level`;
 - the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
 - the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `Candidates`, `Plan`;
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;

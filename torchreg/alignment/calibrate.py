@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -26,7 +25,6 @@ from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import sample_skin
-from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 
 
 @dataclass(frozen=True)
@@ -228,34 +226,18 @@ def _fit_jointly(
         is_last = step == len(widths)
         noise = problem.noise(state) if is_last else SURFACE_FIT.max_noise(problem.size)
         sigma = SURFACE_FIT.width_per_noise * noise if is_last else widths[step] * problem.size
-        solved = levenberg_marquardt(
-            partial(problem.linearize, sigma=sigma, noise=SCALE_FIT.shared_error * noise),
-            state,
-            retract=problem.retract,
-            lower=problem.lower,
-            upper=problem.upper,
-            max_steps=config.steps * (SCALE_FIT.last_steps if is_last else 1),
-            atol=config.align.pose_atol * min(1.0, problem.size),
-        )
-        state = solved.state
-        poses, scales = problem.split(state)
-        poses = poses + problem.shift
+        max_steps = config.steps * (SURFACE_FIT.last_steps if is_last else 1)
+        atol = config.align.pose_atol * min(1.0, problem.size)
+        solved = problem.solve(state, sigma, SCALE_FIT.shared_error * noise, max_steps, atol)
+        state, cost = solved.state, solved.cost[0]
+        poses = problem.carried(state) + problem.shift
         if on_step is not None:
-            lengths, radii = scales.chunk(2)
-            on_step(
-                CalibrateRecord(
-                    round=number,
-                    step=step,
-                    num_steps=len(widths) + 1,
-                    sigma=sigma,
-                    cost=float(solved.cost),
-                    poses=poses,
-                    log_length_scales=lengths,
-                    log_radius_scales=radii,
-                )
-            )
-    problem.set_scales(scales)
-    return poses, solved.cost[0], float(problem.change(solved.last_step))
+            lengths, radii = state[0, poses.shape[-1] :].chunk(2)
+            on_step(CalibrateRecord(
+                round=number, step=step, num_steps=len(widths) + 1, sigma=sigma, cost=float(cost), poses=poses,
+                log_length_scales=lengths, log_radius_scales=radii,
+            ))  # fmt: skip
+    return poses, cost, problem.change(solved.last_step)
 
 
 def _check_poses(shape: ArticulatedShape, initial_poses: Tensor | None, count: int) -> Tensor:

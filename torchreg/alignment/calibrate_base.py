@@ -20,6 +20,7 @@ from torchreg.alignment.base.frames import BaseFrame, read_frames
 from torchreg.alignment.base.search import PosedModel, rank_bases, search_base, seen_shares
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.fit.problem import fitted_surface, model_size
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.results import BaseCalibration
 from torchreg.capture.depth_frame import DepthFrame
@@ -37,12 +38,10 @@ class _Numbers:
     """Numbers of a calibration."""
 
     num_skin: int = 800  # points of the robot's surface in the search and against free space
-    num_fitted: int = 3  # candidates of the search that are fitted
-    num_coarse: int = 400  # data of each frame in these fits
+    num_data: int = 600  # of each frame in fits of candidates, and by which its joints are compared with others
     least_seen: float = 0.2  # share of the side towards the camera that data show: a frame with less has no robot
     least_seen_in_hand: float = 0.02  # the same where the robot carries the camera, which shows little of it
     outlying: float = 0.5  # of the frames' median share, below which a frame is outlying
-    num_moved: int = 600  # data of each frame by which its joints are compared with others
     gained: float = 0.04  # share of them that other joints of a frame explain beyond what they do of other frames
     least_gained: int = 12  # the same in data
     rival: float = 0.2  # relative lead of the best candidate over a different one: less is a doubt
@@ -101,7 +100,7 @@ def calibrate_base(
         skin = sample_skin(shape, _NUMBERS.num_skin)
         size, surface = model_size(skin), fitted_surface(shape)
         models = [PosedModel.of_skin(skin, frame.joints, part) for frame in given]
-        coarse = BaseProblem.of([frame.thinned(_NUMBERS.num_coarse) for frame in given], surface, skin, size, part)
+        coarse = BaseProblem.of([frame.thinned(_NUMBERS.num_data) for frame in given], surface, skin, size, part)
         base, lead = _best_base(coarse, models)
         seen = seen_shares(base, given, models, size)
         least = _NUMBERS.least_seen if part is None else _NUMBERS.least_seen_in_hand
@@ -127,15 +126,15 @@ def _camera_part(shape: ArticulatedShape, link: str | None) -> int | None:
 
 def _fitted(problem: BaseProblem, base: Tensor, offsets: bool) -> BaseFit:
     """Return the fit from a base (4, 4) near the best."""
-    fit = fit_base(problem, problem.state(base), BASE_FIT.widths[-1:])
+    fit = fit_base(problem, problem.state(base), (BASE_FIT.stop,))
     return fit_offsets(fit) if offsets else fit
 
 
 def _wrong_joints(shape: ArticulatedShape, fit: BaseFit) -> list[bool]:
     """Return of each frame of a fit whether other joints explain more of its data, compared with the other frames."""
     surface = fit.problem.surface
-    thinned = [frame.thinned(_NUMBERS.num_moved) for frame in fit.problem.frames]
-    bases = base_of(fit.problem.poses(fit.state)[:, :BASE_DOFS].double())
+    thinned = [frame.thinned(_NUMBERS.num_data) for frame in fit.problem.frames]
+    bases = base_of(fit.problem.poses(fit.state))
     rows = [
         transform_points(invert_rigid(base), frame.points).to(shape.rest)
         for base, frame in zip(bases, thinned, strict=True)
@@ -163,7 +162,8 @@ def _best_base(problem: BaseProblem, models: Sequence[PosedModel]) -> tuple[Tens
     """Return the best base (4, 4) of a search, and its relative lead over the next."""
     frames, size = problem.frames, problem.size
     candidates, _ = search_base(frames, models, size)
-    fitted = [base_of(approach_base(problem, problem.state(base)))[0] for base in candidates[: _NUMBERS.num_fitted]]
+    widths = narrowing(BASE_FIT.start, BASE_FIT.stop)
+    fitted = [base_of(approach_base(problem, problem.state(base), widths))[0] for base in candidates]
     bases, costs = rank_bases(torch.stack(fitted), frames, models, size)
     lead = float(costs[1] / costs[0]) - 1 if len(costs) > 1 else float("inf")
     return bases[0], lead
@@ -179,7 +179,7 @@ def _result(
     is_sole: bool,
 ) -> BaseCalibration:
     everything = replace(fit.problem, frames=tuple(frames))
-    residuals = torch.stack([row.abs().median() for row in everything.residuals(fit.state)])
+    residuals = everything.residuals(fit.state).abs().nanmedian(-1).values
     status = Status.CONVERGED if fit.converged else Status.MAX_STEPS
     if outliers or not is_sole:
         status = Status.WITH_WARNINGS

@@ -30,7 +30,7 @@ from torchreg.alignment.search.landmark_fit import KeypointRows, find_keypoints
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, align_rows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.pose_search import PoseSearch
-from torchreg.alignment.search.rough_poses import PoseSource, bent_pose, register_rigidly
+from torchreg.alignment.search.rough_poses import PoseSource, register_rigidly, typical_poses
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
@@ -40,18 +40,6 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import SkinSurface
-
-
-@dataclass(frozen=True)
-class _Candidates:
-    """Numbers of the candidates."""
-
-    typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
-    fit_steps: int = 3  # at each width of the coarse fit
-    proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
-
-
-_CANDIDATES = _Candidates()
 
 
 @dataclass(frozen=True)
@@ -77,7 +65,7 @@ class FindPoseConfig:
     search_rounds: int = 2
     num_retries: int = 0
     prior_std: float | None = 0.4
-    num_model_points: int = 500
+    num_model_points: int = AlignConfig.num_model_points
     nan_policy: str = "raise"
     upright: Direction | None = None
     seed: int = 0
@@ -179,10 +167,10 @@ def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> Fo
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
         origin = masked_mean(batch, batch_valid)
-        typical = shifted(bent_pose(shape, _CANDIDATES.typical).expand(len(batch), -1), origin)
+        typical = shifted(typical_poses(shape).mean(0).expand(len(batch), -1), origin)
         problem = centered_problem(
-            task.skin(), batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
-            free_space=seen.free_space, keypoints=seen.keypoints,
+            task.skin(), batch, batch_valid, typical, origin, prior_std=config.prior_std,
+            pose_atol=task.config.pose_atol, free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
             problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
@@ -219,7 +207,7 @@ def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
 ) -> Candidates:
     """Return candidates (B, H): a network's, and a search's if in doubt."""
-    problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
+    problem, proposed = source.proposed(problem, config.num_searched)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
     found = Candidates.fitted(problem, proposed)
@@ -260,11 +248,11 @@ def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, 
     rough = source.rough(search.problem, generator)
     ranked = Candidates.ranked(search.problem, *register_rigidly(search.problem, rough, generator))
     if isinstance(problem.surface, SkinSurface):
-        rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.alike, config.num_placed).poses], dim=1)
+        rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.same, config.num_placed).poses], dim=1)
         aligned = align_rows(problem, rough, config.num_searched, generator)
         return Candidates.fitted(problem, aligned)
-    rough = ranked.distinct(SEARCH_BUDGET.alike, config.num_candidates).poses
-    pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
+    rough = ranked.distinct(SEARCH_BUDGET.same, config.num_candidates).poses
+    pool = search.fit_coarsely(rough)[:, : config.num_placed]
     pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
     return Candidates.fitted(problem, poses)

@@ -17,7 +17,7 @@ from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_eve
 from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal, outlier_level
 from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, masked_mean
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
-from torchreg.alignment.inputs import Task, check_clouds, warn_about_degenerate, warn_about_units
+from torchreg.alignment.inputs import UNITS, Task, check_clouds, warn_about_degenerate, warn_about_units
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.search.local_search import explore, needs_search
 from torchreg.alignment.search.multi_start import mean_distances
@@ -33,9 +33,7 @@ from torchreg.solvers.e_step import expectation
 class RowNumbers:
     """Numbers of a batch of alignments."""
 
-    min_inliers: int = 10  # with fewer a pose means nothing
-    min_share: float = 0.02  # the same, as a share of the data
-    num_starts: int = 4  # poses of a search, of which rivals are reported: a box looks alike from as many sides
+    min_share: float = 0.02  # inliers, as a share of the data, with fewer of which a pose means nothing
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
 
 
@@ -235,7 +233,7 @@ def _search(task: Task) -> FoundStarts:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
         config = FindPoseConfig(num_model_points=points, nan_policy=policy, seed=seed)
-        return search_everywhere(task, ROWS.num_starts, config)
+        return search_everywhere(task, config.num_searched, config)
 
 
 def _different(rows: PoseRows, rivals: Tensor) -> Tensor:
@@ -250,7 +248,7 @@ def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, 
         return Status.NO_DATA
     if degenerate:
         return Status.DEGENERATE
-    if num_inliers < max(ROWS.min_inliers, ROWS.min_share * num_data):
+    if num_inliers < max(UNITS.min_data, ROWS.min_share * num_data):
         return Status.FEW_INLIERS
     if confidence < CALIBRATION.doubtful:
         return Status.DOUBTFUL

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from torchreg.solvers.levenberg_marquardt import Linearization
+
 
 def welsch_weight(squared_ratio: Tensor) -> Tensor:
     """Return ``exp(-z)``: 0.37 at the scale, 1e-4 at three scales (Dennis and Welsch 1978)."""
@@ -48,3 +50,17 @@ def cauchy_weight(squared_ratio: Tensor) -> Tensor:
 def cauchy_loss(squared_ratio: Tensor) -> Tensor:
     """Return ``log(1 + z)``, without bound (Holland and Welsch 1977)."""
     return squared_ratio.log1p()
+
+
+def welsch_cost(residual: Tensor, weights: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
+    """Return ``sum_j w_j s^2 rho(r_j^2 / s^2) / 2 n^2`` of residuals (..., M), kernel widths s and noises n (...)."""
+    loss = weights * welsch_loss((residual / sigma.unsqueeze(-1)).square())
+    return 0.5 * (sigma / noise).square() * loss.sum(-1)
+
+
+def welsch_system(residual: Tensor, jacobian: Tensor, weights: Tensor, sigma: Tensor, noise: Tensor) -> Linearization:
+    """Return the `welsch_cost` of residuals (..., M) with a Jacobian (..., M, D), and its Gauss-Newton system."""
+    beta = welsch_weight((residual / sigma.unsqueeze(-1)).square())
+    weighted = jacobian * (weights * beta / noise.square().unsqueeze(-1)).unsqueeze(-1)
+    cost = 0.5 * (sigma / noise).square() * (weights * (1 - beta)).sum(-1)
+    return Linearization(cost, (weighted.mT @ residual.unsqueeze(-1)).squeeze(-1), weighted.mT @ jacobian)

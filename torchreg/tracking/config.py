@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive
+from torchreg.alignment.config import AlignConfig
 from torchreg.geometry.upright import Direction
 
 
@@ -35,7 +36,7 @@ class TrackConfig:
     """
 
     model_points: str = "seen"
-    num_model_points: int = 500
+    num_model_points: int = AlignConfig.num_model_points
     prediction: str = "velocity"
     em_steps: int = 1
     surface_steps: int = 1
@@ -44,7 +45,7 @@ class TrackConfig:
     recovery: str = "full"
     max_points: int = 1500
     sharpness: float | None = None
-    debias: float = 0.8
+    debias: float = AlignConfig.debias
     nan_policy: str = "omit"
     upright: Direction | None = None
     seed: int = 0

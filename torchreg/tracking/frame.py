@@ -31,7 +31,7 @@ class KernelWidths:
     min_start: float = 0.03  # first sigma of the EM where predictions are good: about their error
     max_start: float = ANNEALING.start  # where they are poor: wider, neighboring limbs would share their data
     stop: float = ANNEALING.stop  # last sigma of the EM and of the scores of candidates: near the noise of the data
-    coarse: tuple[float, ...] = (0.06, 0.04, 0.03)  # surface fits from poses that may be far off, in this order
+    coarse: float = 0.06  # first surface fit from poses that may be far off
     surface: float = SURFACE_FIT.widths[-1]  # surface fit before the last one, which follows from the residuals
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import surface_steps
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.shapes.limbs import Limb
@@ -24,7 +25,6 @@ class FastMotion:
 
     paces: tuple[float, ...] = (-1.0, 0.0, 0.5, 1.5, 2.0, 3.0)  # starts in velocities: joints turn back or speed up
     num_scattered: int = 2  # starts with the joints drawn at random
-    num_data: int = 300  # that the starts are fitted to: more lead no better
     score_width: float = 0.012  # kernel of the comparison: a limb on its neighbor's data misses its own by little
     beam: int = 32  # combinations kept from limb to limb
 
@@ -41,9 +41,9 @@ def scatter_joints(pose: Tensor, std: Tensor, count: int, generator: torch.Gener
 def fit_limbs(problem: AlignProblem, starts: Tensor, limbs: Sequence[Limb], generator: torch.Generator) -> Tensor:
     """Return the pose (1, num_dofs) that explains most data, each limb fitted from the best of starts (S, num_dofs)."""
     rows = torch.zeros(len(starts), dtype=torch.long, device=starts.device)
-    batch = problem.draw(FAST_MOTION.num_data, generator).rows(rows)
+    batch = problem.draw(SEARCH_BUDGET.num_coarse_data, generator).rows(rows)
     noise = torch.full_like(starts[:, 0], SEARCH_BUDGET.noise * problem.size)
-    for share in (*WIDTHS.coarse, WIDTHS.stop):
+    for share in narrowing(WIDTHS.coarse, WIDTHS.stop):
         solved = surface_steps(batch, starts, torch.full_like(noise, share * problem.size), noise, 1)
         starts = solved.state
     # A limb without data stays at its prediction.

@@ -13,7 +13,7 @@ from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATI
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
-from torchreg.alignment.search.multi_start import Candidates, Plan
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.geometry.neighbors import NeighborTree, sampling_distance
@@ -32,21 +32,15 @@ class RecoveryPlan:
     """Numbers of the recovery. Lengths are shares of the model's size."""
 
     free_failures: int = 1  # failed searches after which the next, with the limbs placed anew, is due at once
-    search_failed: int = 3  # failed searches after which the limbs are placed thoroughly
-    search_lost: int = 2  # the same in frames since the last fit, after a loss
-    find_failed: int = 5  # failed searches after which the shape is searched everywhere
-    find_lost: int = 3  # the same in frames since the last fit, after a loss
     min_gain: float = 4.0  # soft inliers by which another pose must exceed the predicted one: less is chance
     max_doublings: int = 5  # of the cool-down after more failures, to 32 frames
     occluded: float = 0.6  # of the mean inliers missing from the mean number of data: the shape is probably occluded
     num_searched: int = 2  # known poses whose limbs are placed thoroughly
     max_data: int = 3000  # of a search everywhere: more tell no more
-    num_proposed: int = 3  # poses of a network that are fitted, different ones
     equivalent: float = 0.03  # share of the data that a pose explains less than the best and still counts as good
     max_motion: float = 0.4  # of the base from its prediction per interval: on little data much seems to fit
     max_repetitions: int = 3  # of the first search everywhere, with other draws: nothing is known yet
     more_candidates: int = 2  # of a repetition, in those of the first search
-    new_distance: float = 0.05  # from all of them of what is new, or three times their own distance from each other
     new_share: float = 0.02  # of the data that is new: something has come that may be the shape
     # Confidence of a search everywhere in data that show the shape: of made-up hands with a forearm and a wall it is
     # .27 to .69 in 18 of 19 frames, and .01 to .12 where the hand is left out.
@@ -57,7 +51,7 @@ class RecoveryPlan:
 
 _PLAN = RecoveryPlan()
 # Surface fits from known poses.
-_FROM_KNOWN = Plan(widths=WIDTHS.coarse, steps=2, score_width=WIDTHS.stop)
+_FROM_KNOWN = Plan(start=WIDTHS.coarse, stop=WIDTHS.stop, steps=2)
 
 
 class Recovery:
@@ -145,8 +139,8 @@ class Recovery:
             self.fitter.skin, data[None], valid, state.pose[None], origin[None], prior_std=FindPoseConfig.prior_std,
             pose_atol=0.0,
         )  # fmt: skip
-        _, poses = self.source.proposed(problem, _PLAN.num_proposed)
-        fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0]]
+        _, poses = self.source.proposed(problem, FindPoseConfig.num_searched)
+        fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0].unique(dim=0)]
         return max((fit for fit in fits if fit is not None), key=lambda fit: fit.soft_inliers, default=None)
 
     def _first(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
@@ -168,7 +162,7 @@ class Recovery:
             return False
         apart = 3 * sampling_distance(state.searched)
         distance = NeighborTree(state.searched).nearest(frame.data)[1]
-        new = distance > max(apart, _PLAN.new_distance * self.fitter.size)
+        new = distance > max(apart, SEARCH_BUDGET.same * self.fitter.size)
         return bool(new.float().mean() > _PLAN.new_share)
 
     def _around(
@@ -225,7 +219,7 @@ class Recovery:
             yield self._propose(state, frame)
         if view is not None and (lost or state.failed_searches >= _PLAN.free_failures):
             yield from self._limb_searches(state, view, known, lost, thorough)
-        if thorough and _is_due(state, lost, _PLAN.find_lost, _PLAN.find_failed):
+        if thorough and _is_due(state, lost, stage=3):
             yield self.everywhere(state, frame)
 
     def _limb_searches(
@@ -238,7 +232,7 @@ class Recovery:
         search = PoseSearch(view.problem, frame_generator(state))
         candidates = search.prune(known, _PLAN.num_searched)
         yield self.fitter.fit(view, state, "starts", candidates[:, 0])
-        if thorough and _is_due(state, lost, _PLAN.search_lost, _PLAN.search_failed):
+        if thorough and _is_due(state, lost, stage=2):
             yield self.fitter.fit(view, state, "search", search.refine(candidates, 1)[0][:, 0])
 
 
@@ -264,9 +258,9 @@ def after_pause(state: TrackState) -> TrackState:
     return replace(state, cool_down=max(0, state.cool_down - 1))
 
 
-def _is_due(state: TrackState, lost: bool, num_lost: int, num_failed: int) -> bool:
-    """Return whether it is an attempt's turn: from some lost frames on, or for a doubtful fit after some failures."""
-    return state.lost >= num_lost if lost else state.failed_searches == num_failed
+def _is_due(state: TrackState, lost: bool, stage: int) -> bool:
+    """Return whether it is the turn of a stage of attempts: from as many lost frames on, or at every second failure."""
+    return state.lost >= stage if lost else state.failed_searches == 2 * stage - 1
 
 
 def _may_show(state: TrackState, frame: Frame) -> bool:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.clusters import CLUSTERS, OFF_SURFACE
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.limbs import Limb
@@ -26,7 +27,6 @@ class ClusterTest:
     radius: float = CLUSTERS.radius  # within which they lie, in median distances between neighbors on the surface
     max_radius: float = CLUSTERS.max_radius  # the same, at most: on a sparse surface anything would be a cluster
     num_spacings: int = 100  # data on the surface whose nearest neighbors tell its density
-    same_distance: float = 0.05  # from a cluster of the frame before to the same one, and width of the cells in reach
     max_remembered: int = 300  # unexplained data in a state: more mark no more space
     num_poses: int = 512  # random poses that show what limbs reach: more fill no more cells
 
@@ -39,7 +39,7 @@ class UnexplainedClusters:
 
     def __init__(self, skin: LinearBlendSkin, limbs: Sequence[Limb], size: float) -> None:
         self.size = size
-        self._reach = LimbReach(skin, limbs, _TEST.same_distance * size)
+        self._reach = LimbReach(skin, limbs, SEARCH_BUDGET.same * size)
 
     def find(self, data: Tensor, distance: Tensor, residual: Tensor) -> Tensor:
         """Return the data (K, 3) off the surface that lie as densely as those on it; most outliers are sparse.
@@ -58,14 +58,14 @@ class UnexplainedClusters:
     def count_new(self, state: TrackState, clusters: Tensor, trunk: Tensor) -> int:
         """Return the number of data (K, 3) in reach of limbs and in no cluster that is known, for a trunk at (4, 4)."""
         known = transform_points(trunk, state.unexplained)
-        new = nearest_distance(clusters, known) > _TEST.same_distance * self.size
+        new = nearest_distance(clusters, known) > SEARCH_BUDGET.same * self.size
         return int((new & self._reach(clusters, trunk)).sum())
 
     def remember(self, state: TrackState, clusters: Tensor, trunk: Tensor) -> Tensor:
         """Return the unexplained data (S, 3) to expect in the next frame, in the frame of the trunk at (4, 4)."""
         latest = transform_points(invert_rigid(trunk), clusters)
         # Where a cluster persists, its data of earlier frames show better how far it extends.
-        persistent = nearest_distance(state.unexplained, latest) < _TEST.same_distance * self.size
+        persistent = nearest_distance(state.unexplained, latest) < SEARCH_BUDGET.same * self.size
         return torch.cat([latest, state.unexplained[persistent]])[: _TEST.max_remembered]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,7 +10,6 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.base.fit import BaseFit
 from torchreg.shapes.pose_algebra import BASE_DOFS
-from torchreg.solvers.robust import welsch_weight
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,8 @@ def base_covariance(fit: BaseFit) -> tuple[Tensor, Tensor]:
 
     References: Laird and Ware 1982; Schmidt 1966; Efron and Stein 1981.
     """
-    gradients, hessians = _frame_systems(fit)
-    prior = fit.problem.precision()
+    prior, seen = fit.problem.precision(), fit.problem.facing(fit.state)
+    _, gradients, hessians = fit.problem.systems(fit.state, seen, fit.sigma, fit.noise)
     slides = fit.problem.skin.shape.is_sliding[BASE_DOFS:].cpu()
     joint_std = torch.where(slides, fit.noise, fit.noise / (_ERRORS.lever * fit.problem.size)).double()
     shared = torch.where(fit.problem.free, prior[_FIT:], joint_std**-2)
@@ -63,26 +62,3 @@ def _jackknife(gradients: Tensor, hessians: Tensor, prior: Tensor) -> Tensor:
     moved = (torch.linalg.pinv(left, hermitian=True) @ gradients.unsqueeze(-1))[:, :BASE_DOFS, 0]
     moved = moved - moved.mean(0)
     return (count - 1) / count * moved.mT @ moved
-
-
-def _frame_systems(fit: BaseFit) -> tuple[Tensor, Tensor]:
-    """Return gradients (T, D) and Gauss-Newton Hessians (T, D, D) of the data of each frame alone.
-
-    The variables are those of the state, all joints free, and the relative error of all distances from the camera.
-    """
-    problem, gradients, hessians = fit.problem, [], []
-    for frame, share in zip(problem.frames, problem.shares, strict=True):
-        alone = replace(problem, frames=(frame,), shares=(share,))
-        seen = alone.facing(fit.state)
-        gradient, hessian = torch.zeros(()).double(), torch.zeros(()).double()
-        for number, (residual, jacobian, weight) in enumerate(alone.terms(fit.state, seen)):
-            along = torch.zeros_like(residual)  # free space, the second term, does not depend on distances
-            if number == 0:
-                along = -(jacobian[:, :3] * alone.data[0][seen].cpu().double()).sum(-1)
-            rows = torch.cat([jacobian, along.unsqueeze(-1)], dim=-1)
-            beta = welsch_weight((residual / fit.sigma).square())
-            weighted = rows * (weight * beta / fit.noise**2).unsqueeze(-1)
-            gradient, hessian = gradient + weighted.mT @ residual, hessian + weighted.mT @ rows
-        gradients.append(gradient)
-        hessians.append(hessian)
-    return torch.stack(gradients), torch.stack(hessians)

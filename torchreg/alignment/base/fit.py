@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -12,24 +12,26 @@ from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg.alignment.base.frames import BaseFrame, carrier
+from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
 from torchreg.alignment.fit.patches import independent_share
+from torchreg.alignment.fit.problem import masked_mean
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.free_space import FreeSpace
-from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import skew, so3_exp, so3_log
-from torchreg.shapes.pose_algebra import BASE_DOFS, retract
+from torchreg.shapes.pose_algebra import BASE_DOFS, retract, shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import ShapeSurface
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
-from torchreg.solvers.robust import welsch_weight
+from torchreg.solvers.robust import welsch_system
 
 
 @dataclass(frozen=True)
 class BaseFitNumbers:
     """Numbers of the fit of a base; lengths are shares of the model's size."""
 
-    widths: tuple[float, ...] = (0.09, 0.05, 0.03)  # of the kernel before the last one, which follows from the noise
+    start: float = 0.09  # first kernel
+    stop: float = 0.03  # of the kernel before the last one, which follows from the noise
     steps: int = 3  # at each of them
     last_steps: int = 20  # of each round at the last one, at most
     rounds: int = 8  # at the last one, at most
@@ -38,7 +40,6 @@ class BaseFitNumbers:
     offset_std: float = 0.05  # of a joint's offset about zero, radians: three degrees
     slide_std: float = 0.01  # the same of joints that slide
     max_posterior_to_prior_std: float = 0.3  # of an offset that the data determine
-    space_share: float = 0.25  # of its area that a surface shows from a direction, on average (Cauchy)
 
 
 BASE_FIT = BaseFitNumbers()
@@ -90,98 +91,105 @@ class BaseProblem:
         return torch.cat([head, std**-2])
 
     def poses(self, state: Tensor) -> Tensor:
-        """Return the pose (T, num_dofs) of each frame, in the shape's dtype."""
+        """Return the pose (T, num_dofs), float64, of each frame in its camera's coordinates."""
         joints = torch.stack([frame.joints for frame in self.frames]) + state[0, _OFFSETS:]
         bases = base_of(state) @ invert_rigid(carrier(self.skin.shape, joints, self.camera_part))
-        base = torch.cat([bases[:, :3, 3], so3_log(bases[:, :3, :3])], dim=-1)
-        return torch.cat([base, joints], dim=-1).to(self.skin.shape.rest)
+        return torch.cat([bases[:, :3, 3], so3_log(bases[:, :3, :3]), joints], dim=-1)
 
-    def _chart(self, state: Tensor, poses: Tensor) -> Tensor | None:
-        """Return the derivatives (T, 6 + J, 6 + J) of poses by the state without depth; None where they are one."""
-        if self.camera_part is None:
-            return None
-        shape, part, count = self.skin.shape, self.camera_part, poses.shape[-1]
-        rows, derivative = (value.cpu().double() for value in shape.transform_jacobian(poses, chart="tangent"))
+    def _chart(self, state: Tensor) -> Tensor:
+        """Return the derivatives (T, 6 + J, 6 + J) of poses by the state without depth."""
+        shape, part, poses = self.skin.shape, self.camera_part, self.poses(state)
+        chart = torch.eye(poses.shape[-1], dtype=torch.float64).repeat(len(poses), 1, 1)
+        if part is None:
+            return chart
+        moves = shape.transform_jacobian(poses.to(shape.rest), chart="tangent")
+        rows, derivative = (value.cpu().double() for value in moves)
         link = rows[:, 4 * part : 4 * part + 4].mT
         moved = derivative[:, 4 * part : 4 * part + 4, :, BASE_DOFS:].movedim(-1, 1).mT
         spin = moved[..., :3] @ link[:, None, :, :3].mT
         turn = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], dim=-1)
         # The link stays where it is in the camera: the base moves against it, turned about the link.
-        base = poses[:, None, :3].cpu().double()
+        base = poses[:, None, :3]
         shift = -moved[..., 3] - torch.linalg.cross(turn, base - link[:, None, :, 3])
-        chart = torch.eye(count, dtype=torch.float64).repeat(len(poses), 1, 1)
         chart[:, :BASE_DOFS, BASE_DOFS:] = torch.cat([shift, -turn], dim=-1).mT
         chart[:, :3, 3:BASE_DOFS] = -skew(base[:, 0] - state[0, :3])
         return chart
 
     @cached_property
-    def data(self) -> tuple[Tensor, Tensor]:
-        """The data of all frames (T, M, 3), in the shape's dtype, and which of them are (T, M): the rest pads."""
-        rows = [frame.points.to(self.skin.shape.rest) for frame in self.frames]
-        valid = [torch.ones(len(row), dtype=torch.bool) for row in rows]
-        return pad_sequence(rows, batch_first=True), pad_sequence(valid, batch_first=True)
+    def data(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The data (T, M, 3) of all frames, float64, which of them are no padding (T, M), and their means (T, 3)."""
+        points = pad_sequence([frame.points for frame in self.frames], batch_first=True)
+        counts = torch.tensor([len(frame.points) for frame in self.frames])
+        valid = torch.arange(points.shape[1]) < counts.unsqueeze(-1)
+        return points, valid, masked_mean(points, valid)
 
     @cached_property
-    def skin_area(self) -> float:
-        """The area that a point of the skin stands for, square metres."""
-        return sampling_distance(self.skin.points) ** 2
+    def free_space(self) -> tuple[Tensor, FreeSpaceTerm] | None:
+        """The frames (R,) with a mask, and what their skin costs beside it, about the means of their data."""
+        index = [number for number, frame in enumerate(self.frames) if frame.free_space is not None]
+        spaces = [frame.free_space for frame in self.frames if frame.free_space is not None]
+        if not spaces:
+            return None
+        space = FreeSpace.stacked(spaces).to(self.skin.shape.rest).moved(self.data[2][index])
+        term = FreeSpaceTerm.of_skin(space, self.skin, size=0.0)
+        return torch.tensor(index), term.thinned(torch.tensor(self.shares)[index].reciprocal().to(term.skin.points))
 
-    def residuals(self, state: Tensor) -> list[Tensor]:
-        """Return the distance (M,) of each frame's data from the surface as it was measured, float64."""
-        points, valid = self.data
-        distance = self.surface.distance(points, self.poses(state)).cpu().double() - state[0, _DEPTH]
-        return [row[kept] for row, kept in zip(distance, valid, strict=True)]
+    def _distances(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distance (T, M) of the data from the surface as it was measured, and the Jacobian (T, M, 8 + J).
+
+        The Jacobian is that by the poses, the depth, and the relative error of all distances from the camera.
+        """
+        points, _, origin = self.data
+        centered = (points - origin.unsqueeze(1)).to(self.skin.shape.rest)
+        found = self.surface.distance_jacobian(centered, self._centered(state))
+        distance, by_pose = (value.cpu().double() for value in found)
+        by_scale = -(by_pose[..., :3] * points).sum(-1, keepdim=True)
+        return distance - state[0, _DEPTH], torch.cat([by_pose, -torch.ones_like(by_scale), by_scale], dim=-1)
+
+    def _centered(self, state: Tensor) -> Tensor:
+        """Return the poses (T, num_dofs) about the means of the data, where float32 is precise."""
+        return shifted(self.poses(state), -self.data[2]).to(self.skin.shape.rest)
+
+    def residuals(self, state: Tensor) -> Tensor:
+        """Return the distance (T, M) of the data from the surface as it was measured, float64, NaN where they pad."""
+        return torch.where(self.data[1], self._distances(state)[0], torch.nan)
 
     def facing(self, state: Tensor) -> Tensor:
         """Return which data (T, M) lie on surfaces that face the camera, the only ones that it can have measured."""
-        points, valid = self.data
-        jacobian = self.surface.distance_jacobian(points, self.poses(state))[1]
-        return ((jacobian[..., :3] * points).sum(-1) > 0) & valid
+        return (self._distances(state)[1][..., -1] < 0) & self.data[1]
+
+    def systems(self, state: Tensor, seen: Tensor, sigma: float, noise: float) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian (T, 8 + J) of each frame's data ``seen`` (T, M) alone.
+
+        The unknowns are those of the state, all joints free, and the relative error of all distances from the camera.
+        """
+        distance, jacobian = self._distances(state)
+        sigmas, noises = (torch.full_like(distance[:, 0], value) for value in (sigma, noise))
+        weights = seen * torch.tensor(self.shares, dtype=torch.float64).unsqueeze(-1)
+        found = welsch_system(distance, jacobian, weights, sigmas, noises)
+        if self.free_space is not None:
+            index, term = self.free_space
+            poses = self._centered(state)[index]
+            beside = term.linearized(poses, sigmas[index].to(poses), noises[index].to(poses))
+            padded = beside.cost, pad(beside.gradient, (0, 2)), pad(beside.hessian, (0, 2, 0, 2))
+            for total, part in zip(found, padded, strict=True):
+                total.index_add_(0, index, part.cpu().double())
+        chart = pad(self._chart(state), (0, 2, 0, 2))
+        chart[:, -2:, -2:] = torch.eye(2)
+        # The depth of a state comes after its base.
+        order = [*range(BASE_DOFS), -2, *range(BASE_DOFS, chart.shape[-1] - 2), -1]
+        chart = chart[..., order]
+        gradient = (chart.mT @ found.gradient.unsqueeze(-1)).squeeze(-1)
+        return Linearization(found.cost, gradient, chart.mT @ found.hessian @ chart)
 
     def linearize(self, state: Tensor, seen: Tensor, sigma: float, noise: float) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian of the data ``seen`` (T, M); sigma and noise in metres."""
-        prior = self.precision()
-        cost, gradient, hessian = 0.5 * (prior * state[0].square()).sum(), prior * state[0], torch.diag(prior)
-        for residual, jacobian, weight in self.terms(state, seen):
-            beta = welsch_weight((residual / sigma).square())
-            weighted = jacobian * (weight * beta / noise**2).unsqueeze(-1)
-            cost = cost + 0.5 * (weight * (1 - beta)).sum() * (sigma / noise) ** 2
-            gradient, hessian = gradient + weighted.mT @ residual, hessian + weighted.mT @ jacobian
+        frames, prior = self.systems(state, seen, sigma, noise), self.precision()
         held = torch.cat([torch.zeros(_OFFSETS, dtype=torch.bool), ~self.free])
-        gradient = gradient.masked_fill(held, 0.0)
-        return Linearization(cost[None], gradient[None], hessian.masked_fill(held | held.unsqueeze(-1), 0.0)[None])
-
-    def terms(self, state: Tensor, seen: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield residuals (N,), their Jacobian (N, 7 + J) and weights (N,): of the data, and of what is not there."""
-        poses = self.poses(state)
-        distance, jacobian = self.surface.distance_jacobian(self.data[0], poses)
-        chart = self._chart(state, poses)
-        jacobian = jacobian if chart is None else jacobian.cpu().double() @ chart
-        weight = torch.tensor(self.shares, dtype=torch.float64).unsqueeze(-1).expand(seen.shape)
-        yield distance[seen].cpu().double() - state[0, _DEPTH], _with_depth(jacobian[seen], -1.0), weight[seen]
-        rows, derivatives = self.skin.shape.transform_jacobian(poses, chart="tangent")
-        placed = self.skin.place(rows)
-        if chart is not None:
-            derivatives = (derivatives.cpu().double() @ chart.unsqueeze(1)).to(derivatives)
-        for frame, share, points, derivative in zip(self.frames, self.shares, placed, derivatives, strict=True):
-            if frame.free_space is not None:
-                yield self._beside(frame.free_space, share, points, derivative)
-
-    def _beside(
-        self, space: FreeSpace, share: float, points: Tensor, derivative: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return residuals, Jacobian and weights of the skin's points (N, 3) where a frame saw nothing."""
-        intrusion, slope = (value[0].to(points) for value in space.intrusion_gradient(points[None].to(space.depth)))
-        along = (self.skin.basis.unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
-        shown = BASE_FIT.space_share * self.skin_area / float(space.datum_area) / points[:, 2].double().mean().square()
-        weight = (share * shown).expand(len(points))
-        return intrusion.cpu().double(), _with_depth(along @ derivative.flatten(-3, -2), 0.0), weight
-
-
-def _with_depth(jacobian: Tensor, by_depth: float) -> Tensor:
-    """Return a Jacobian (N, 6 + J) by poses as one (N, 7 + J) by states, float64."""
-    base, joints = jacobian.cpu().double().split([BASE_DOFS, jacobian.shape[-1] - BASE_DOFS], dim=-1)
-    return torch.cat([base, torch.full_like(base[:, :1], by_depth), joints], dim=-1)
+        cost = frames.cost.sum(0, keepdim=True) + 0.5 * (prior * state.square()).sum(-1)
+        gradient = (frames.gradient[:, :-1].sum(0, keepdim=True) + prior * state).masked_fill(held, 0.0)
+        hessian = frames.hessian[:, :-1, :-1].sum(0, keepdim=True) + prior.diag()
+        return Linearization(cost, gradient, hessian.masked_fill(held | held.unsqueeze(-1), 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,11 +227,11 @@ def base_of(state: Tensor) -> Tensor:
     return rigid_matrix(so3_exp(state[:, 3:BASE_DOFS]), state[:, :3])
 
 
-def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> BaseFit:
+def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float]) -> BaseFit:
     """Return the state after a fit with kernels of some widths, shares of the size, and one that follows the noise."""
     state = approach_base(problem, state, widths)
-    residual = torch.cat(problem.residuals(state))
-    noise = float(surface_noise(residual, torch.ones_like(residual, dtype=torch.bool), problem.size))
+    residual = problem.residuals(state).flatten()
+    noise = float(surface_noise(residual, residual.isfinite(), problem.size))
     sigma = SURFACE_FIT.width_per_noise * noise
     for _ in range(BASE_FIT.rounds):
         before, state = state, _solve(problem, state, sigma, noise, BASE_FIT.last_steps)
@@ -233,7 +241,7 @@ def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE
     return BaseFit(problem=problem, state=state, sigma=sigma, noise=noise, converged=converged)
 
 
-def approach_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> Tensor:
+def approach_base(problem: BaseProblem, state: Tensor, widths: Sequence[float]) -> Tensor:
     """Return the state after a few steps with a kernel of each of some widths, shares of the size."""
     noise = SURFACE_FIT.max_noise(problem.size)
     for width in widths:
@@ -273,4 +281,4 @@ def fit_offsets(fit: BaseFit) -> BaseFit:
         free[worst] = False
     state = fit.state.clone()
     state[0, _OFFSETS:] = torch.where(free, found.state[0, _OFFSETS:], 0.0)
-    return fit_base(replace(problem, free=free), state, widths=BASE_FIT.widths[-1:])
+    return fit_base(replace(problem, free=free), state, widths=(BASE_FIT.stop,))

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.base.frames import BaseFrame, carrier
+from torchreg.alignment.fit.sigma_schedule import narrowing
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import spread_rotations
@@ -23,17 +25,13 @@ class _BaseSearch:
     """Numbers of the search; widths are shares of the model's size."""
 
     num_rotations: int = 300  # tried, 30 degrees apart
-    # Kernel of each step, and the candidates that go on after it.
-    steps: tuple[tuple[float, int], ...] = (
-        (0.15, 150), (0.12, 150), (0.1, 80), (0.08, 80), (0.06, 40), (0.05, 40), (0.04, 20), (0.04, 20), (0.03, 12),
-        (0.03, 12),
-    )  # fmt: skip
+    start: float = 0.15  # first kernel; after each, the better half of the candidates go on
+    steps: int = 2  # with each kernel
     num_data: int = 450  # of all frames together
-    num_kept: int = 5  # candidates returned, at most
-    score_width: float = 0.03  # of the kernel by which candidates are ranked
+    num_kept: int = 3  # candidates returned, at most
+    score_width: float = 0.03  # of the last kernel, by which candidates are ranked
     gap: float = 4.0  # typical angles between data, beyond which a model point is beside all that was seen
     same_turn: float = 0.2  # candidates whose bases differ by less are one, radians
-    same_shift: float = 0.05  # the same, as a share of the size
 
 
 _SEARCH = _BaseSearch()
@@ -68,9 +66,11 @@ def search_base(frames: Sequence[BaseFrame], models: Sequence[PosedModel], size:
     """
     data = _drawn(frames)
     candidates = _starts(data, models)
-    for width, count in _SEARCH.steps:
-        candidates, cost = _step(candidates, data, models, width * size)
-        candidates = candidates[cost.argsort()[:count]]
+    for width in narrowing(_SEARCH.start, _SEARCH.score_width):
+        count = -(-len(candidates) // 2)
+        for _ in range(_SEARCH.steps):
+            candidates, cost = _step(candidates, data, models, width * size)
+            candidates = candidates[cost.argsort()[:count]]
     return rank_bases(candidates, frames, models, size)
 
 
@@ -167,7 +167,7 @@ def _distinct(candidates: Tensor, cost: Tensor, size: float) -> tuple[Tensor, Te
         traces = (others[:, :3, :3] * candidates[number, :3, :3]).sum((-2, -1))
         turn = ((traces - 1) / 2).clamp(-1, 1).arccos()
         shift = (others[:, :3, 3] - candidates[number, :3, 3]).norm(dim=-1)
-        if not bool(((turn < _SEARCH.same_turn) & (shift < _SEARCH.same_shift * size)).any()):
+        if not bool(((turn < _SEARCH.same_turn) & (shift < SEARCH_BUDGET.same * size)).any()):
             kept.append(number)
     kept = kept[: _SEARCH.num_kept]
     return candidates[kept], cost[kept]

@@ -117,7 +117,7 @@ def _gain(
 ) -> Tensor:
     """Return the log-likelihood (B,) that another step of the last fit promises, all data counted."""
     objective = surface_objective(problem, SURFACE_FIT.width_per_noise * noise, noise)
-    gradient = objective.linearize(pose, distance, jacobian).gradient
+    gradient = objective(pose, distance, jacobian).gradient
     slope = gradient * ~held_at_limits(gradient, pose, problem.lower, problem.upper)
     return 0.5 * (slope.unsqueeze(-2) @ covariance @ slope.unsqueeze(-1)).flatten()
 

@@ -88,7 +88,7 @@ def anneal(
             matches = _match(problem, rows, posed, sigma)
             prior = _tempered_prior(problem, matches)
             objective = registration_objective(problem.skin, matches, sigma, prior, problem.factors)
-            around = objective.linearize(pose, rows, derivative)
+            around = objective(pose, rows, derivative)
             if m_steps > 1:
                 solved = problem.solve(objective, pose, m_steps, around, damping)
             else:

@@ -12,7 +12,7 @@ from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.neighbors import sampling_distance
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization
-from torchreg.solvers.robust import welsch_loss, welsch_weight
+from torchreg.solvers.robust import welsch_cost, welsch_loss, welsch_system
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ class FreeSpaceTerm(Factor):
 
     def cost(self, pose: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
         """Return the cost (B,) of poses in the units of a surface fit of widths and noises (B,)."""
-        loss = welsch_loss((self.intrusion(self.skin(pose)) / sigma.unsqueeze(-1)).square()).sum(-1)
-        return 0.5 * self.weight() * (sigma / noise).square() * loss
+        return welsch_cost(self.intrusion(self.skin(pose)), self.weight().unsqueeze(-1), sigma, noise)
 
     def linearized(self, pose: Tensor, sigma: Tensor, noise: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
@@ -81,11 +80,6 @@ class FreeSpaceTerm(Factor):
         # Where points do not intrude, and few do, cost and derivatives are zero.
         index, intrusion, slope = self.free_space.intruding(points, self.tolerance)
         residual = (intrusion - self.tolerance).clamp_min(0)
-        beta = welsch_weight((residual / sigma.unsqueeze(-1)).square())
-        weight = (self.weight() / noise.square()).unsqueeze(-1)
         along = (self.skin.basis[index].unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
         jacobian = (along @ derivative.flatten(-3, -2)) * (residual > 0).unsqueeze(-1)
-        weighted = jacobian * (weight * beta).unsqueeze(-1)
-        cost = 0.5 * weight[:, 0] * sigma.square() * (1 - beta).sum(-1)
-        gradient = (weighted.mT @ residual.unsqueeze(-1)).squeeze(-1)
-        return Linearization(cost, gradient, weighted.mT @ jacobian)
+        return welsch_system(residual, jacobian, self.weight().unsqueeze(-1), sigma, noise)

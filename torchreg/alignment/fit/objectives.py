@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchreg.alignment.fit.factors import Factor
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
@@ -16,7 +15,7 @@ from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import ShapeSurface
 from torchreg.solvers.e_step import EStep
 from torchreg.solvers.levenberg_marquardt import Linearization
-from torchreg.solvers.robust import welsch_weight
+from torchreg.solvers.robust import welsch_cost, welsch_system
 
 # The base is damped, in the Hessian alone, as if by this share of a datum: more slows down starts near few data.
 _BASE_DAMPING_DATA = 0.1
@@ -33,17 +32,13 @@ class GaussianPosePrior:
     precision: Tensor
     holds_base: bool = False
 
-    def add_to(self, problem: Linearization, pose: Tensor) -> Linearization:
-        """Return the problem with the prior added."""
+    def linearized(self, pose: Tensor, *_kernel: Tensor) -> Linearization:
+        """Return cost, gradient and Hessian at poses (B, num_dofs)."""
         offset = self._offset(pose, self.mean)
         gradient = self.precision * offset
-        return Linearization(
-            problem.cost + 0.5 * (gradient * offset).sum(-1),
-            problem.gradient + gradient,
-            problem.hessian + torch.diag_embed(self.precision),
-        )
+        return Linearization(0.5 * (gradient * offset).sum(-1), gradient, torch.diag_embed(self.precision))
 
-    def cost(self, pose: Tensor) -> Tensor:
+    def cost(self, pose: Tensor, *_kernel: Tensor) -> Tensor:
         """Return the prior's cost (...) of poses (..., num_dofs); the mean's batch is the first dimension."""
         mean = self.mean.reshape(self.mean.shape[0], *[1] * (pose.ndim - 2), -1)
         precision = self.precision
@@ -55,51 +50,34 @@ class GaussianPosePrior:
         return difference(mean, pose) if self.holds_base else pose - mean
 
 
-class DataTerm(Protocol):
-    """What the data of a fit say of poses (B, num_dofs)."""
+class Term(Protocol):
+    """A summand of an objective of poses (B, num_dofs): data, a `Factor`, or the prior."""
 
-    def residuals(self, pose: Tensor) -> tuple[Any, ...]:
-        """Return what `linearized` needs besides the pose."""
+    def linearized(self, pose: Tensor, sigma: Tensor, noise: Tensor, *residuals: Any) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian; of data, given what the term computes of a pose first."""
 
-    def linearized(self, *residuals: Any) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian."""
-
-    def cost(self, pose: Tensor) -> Tensor:
+    def cost(self, pose: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
         """Return the cost alone (B,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """What a fit minimizes over poses (B, num_dofs): data, where there are any, factors, and the prior.
+    """What a fit minimizes over poses (B, num_dofs): the sum of terms, with kernel widths and noises (B,), metres."""
 
-    ``sigma`` and ``noise`` (B,), metres, are the kernel widths and noises that the factors are weighed with.
-    """
-
-    data: DataTerm | None
-    factors: Sequence[Factor]
-    prior: GaussianPosePrior
+    terms: Sequence[Term]
     sigma: Tensor
     noise: Tensor
 
-    def __call__(self, pose: Tensor) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
-        return self.linearize(pose, *(() if self.data is None else self.data.residuals(pose)))
-
-    def linearize(self, pose: Tensor, *residuals: Any) -> Linearization:
-        """Return the same, given the `residuals` of the data at the pose."""
-        terms = [] if self.data is None else [self.data.linearized(*residuals)]
-        terms += [factor.linearized(pose, self.sigma, self.noise) for factor in self.factors]
-        problem = terms[0]
-        for term in terms[1:]:
-            problem = problem.plus(term)
-        return self.prior.add_to(problem, pose)
+    def __call__(self, pose: Tensor, *residuals: Any) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs), given residuals of the first term."""
+        problem = self.terms[0].linearized(pose, self.sigma, self.noise, *residuals)
+        for term in self.terms[1:]:
+            problem = problem.plus(term.linearized(pose, self.sigma, self.noise))
+        return problem
 
     def cost(self, pose: Tensor) -> Tensor:
         """Return the cost alone (B,), in a half to a third of the time."""
-        cost = self.prior.cost(pose)
-        for factor in self.factors:
-            cost = cost + factor.cost(pose, self.sigma, self.noise)
-        return cost if self.data is None else self.data.cost(pose) + cost
+        return torch.stack([term.cost(pose, self.sigma, self.noise) for term in self.terms]).sum(0)
 
 
 class SoftMatches:
@@ -114,12 +92,9 @@ class SoftMatches:
         self.weights = (weights / (sigma * sigma).unsqueeze(-1)).unsqueeze(-1)
         self.curvature = None if skin.basis is None else skin.basis.mT @ (self.weights * skin.basis)
 
-    def residuals(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the part transforms of poses (B, num_dofs) and their derivatives, see `transform_jacobian`."""
-        return self.skin.row_jacobian(pose)
-
-    def linearized(self, rows: Tensor, derivative: Tensor) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian at a pose with part transforms and derivatives."""
+    def linearized(self, pose: Tensor, _sigma: Tensor, _noise: Tensor, *residuals: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian, given the skin's rows and their derivatives at the pose."""
+        rows, derivative = residuals or self.skin.row_jacobian(pose)
         residual = self.skin.place(rows) - self.targets
         weighted = self.weights * residual
         flat = derivative.flatten(-3, -2)
@@ -132,51 +107,39 @@ class SoftMatches:
         curved = curved.reshape(flat.shape)
         return Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
 
-    def cost(self, pose: Tensor) -> Tensor:
+    def cost(self, pose: Tensor, _sigma: Tensor, _noise: Tensor) -> Tensor:
         """Return the cost alone (B,)."""
         residual = self.skin(pose) - self.targets
         return 0.5 * (self.weights * residual * residual).sum((-2, -1))
 
 
+@dataclass(frozen=True, eq=False)
 class SurfaceDistances:
     """Eqs. 21 and 22: squared surface distances of the data, each weighted by ``beta = exp(-d^2 / sigma_s^2)``.
 
-    Beta at every pose makes it the Welsch function ``sigma_s^2 (1 - beta) / 2``. Sigma and noise (B,) are in metres;
-    ``lever`` is the distance of the shape's points from the base's axis of rotation.
+    Beta at every pose makes it the Welsch function ``sigma_s^2 (1 - beta) / 2``. ``lever``, metres, is the distance of
+    the shape's points from the base's axis of rotation.
     """
 
-    def __init__(
-        self, surface: ShapeSurface, data: Tensor, valid: Tensor, sigma: Tensor, noise: Tensor, lever: float
-    ) -> None:
-        self.surface, self.data, self.valid = surface, data, valid
-        self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
-        self.scale = noise.square().reciprocal()
-        # Motions of the base that the data leave free, as along a cylinder's axis, are then not taken.
-        stiffness = _BASE_DAMPING_DATA * self.inverse_square
-        turns = pad((stiffness * lever**2).expand(-1, 3), (3, 0))
-        self.base_damping = turns + pad(stiffness.expand(-1, 3), (0, 3))
+    surface: ShapeSurface
+    data: Tensor
+    valid: Tensor
+    lever: float
 
-    def residuals(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distances (B, M) of the data in poses (B, num_dofs) and their Jacobian."""
-        return self.surface.distance_jacobian(self.data, pose)
-
-    def linearized(self, distance: Tensor, jacobian: Tensor) -> Linearization:
+    def linearized(self, pose: Tensor, sigma: Tensor, noise: Tensor, *residuals: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian, given the distances and their Jacobian at the pose."""
-        beta = self._beta(distance)
-        weighted = jacobian * (beta * self.valid * self.scale.unsqueeze(-1)).unsqueeze(-1)
-        gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
-        damping = pad(self.base_damping, (0, jacobian.shape[-1] - BASE_DOFS))
-        return Linearization(self._robust_cost(beta), gradient, weighted.mT @ jacobian + torch.diag_embed(damping))
+        distance, jacobian = residuals or self.surface.distance_jacobian(self.data, pose)
+        found = welsch_system(distance, jacobian, self.valid, sigma, noise)
+        # Motions of the base that the data leave free, as along a cylinder's axis, are then not taken.
+        stiffness = (_BASE_DAMPING_DATA / sigma.square()).unsqueeze(-1)
+        diagonal = found.hessian.diagonal(dim1=-2, dim2=-1)
+        diagonal[..., :3] += stiffness
+        diagonal[..., 3:BASE_DOFS] += stiffness * self.lever**2
+        return found
 
-    def cost(self, pose: Tensor) -> Tensor:
+    def cost(self, pose: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
         """Return the cost alone (B,)."""
-        return self._robust_cost(self._beta(self.surface.distance(self.data, pose)))
-
-    def _beta(self, distance: Tensor) -> Tensor:
-        return welsch_weight(distance.square() * self.inverse_square)
-
-    def _robust_cost(self, beta: Tensor) -> Tensor:
-        return 0.5 * ((1 - beta) * self.valid).sum(-1) / self.inverse_square.squeeze(-1) * self.scale
+        return welsch_cost(self.surface.distance(self.data, pose), self.valid, sigma, noise)
 
 
 def registration_objective(
@@ -184,7 +147,7 @@ def registration_objective(
 ) -> Objective:
     """Return the objective of an M-step: eq. 20 with the factors that count beside soft matches."""
     counted = [factor for factor in factors if factor.beside_matches]
-    return Objective(SoftMatches(skin, matches, sigma), counted, prior, sigma, sigma)
+    return Objective((SoftMatches(skin, matches, sigma), *counted, prior), sigma, sigma)
 
 
 def distance_objective(
@@ -198,4 +161,4 @@ def distance_objective(
     factors: Sequence[Factor] = (),
 ) -> Objective:
     """Return the objective of a surface fit, see `SurfaceDistances`."""
-    return Objective(SurfaceDistances(surface, data, valid, sigma, noise, lever), factors, prior, sigma, noise)
+    return Objective((SurfaceDistances(surface, data, valid, lever), *factors, prior), sigma, noise)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,13 +20,8 @@ from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.shaped import ShapedSkin
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
-from torchreg.solvers.levenberg_marquardt import (
-    Linearization,
-    LMResult,
-    damped_step,
-    held_at_limits,
-    levenberg_marquardt,
-)
+from torchreg.solvers.arrow import SharedRows
+from torchreg.solvers.levenberg_marquardt import Linearization, LMResult
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 OneFactor = TypeVar("OneFactor", bound=Factor)
@@ -60,7 +55,7 @@ class AlignProblem:
 
     Data (B, M, 3) in metres from the origins (B, 3); `size`, the diagonal of the model at rest, is the unit of all
     thresholds; `debias` is the share of the kernel's shrinkage that is corrected in the targets of the EM; normals (B,
-    M, 3) of the data count in the EM.
+    M, 3) of the data count in the EM. Successive rows, `scans` each, share coefficients.
     """
 
     skin: LinearBlendSkin
@@ -79,8 +74,9 @@ class AlignProblem:
     factors: tuple[Factor, ...] = ()
     prior_precision: Tensor | None = None
     normals: Tensor | None = None
+    scans: int = 1
 
-    def rows(self, index: Tensor) -> AlignProblem:
+    def rows(self, index: Tensor) -> Self:
         """Return the problems of some rows of the batch, which may repeat."""
         return replace(
             self,
@@ -95,23 +91,28 @@ class AlignProblem:
             normals=None if self.normals is None else self.normals[index],
         )
 
-    def repeated(self, count: int) -> AlignProblem:
+    def repeated(self, count: int) -> Self:
         """Return the batch with every problem ``count`` times in a row."""
         return self.rows(torch.arange(len(self.data), device=self.data.device).repeat_interleave(count))
 
-    def draw(self, count: int, generator: torch.Generator) -> AlignProblem:
+    def draw(self, count: int, generator: torch.Generator) -> Self:
         """Return the problem with at most ``count`` data, drawn from the valid ones, the same alone and in a batch."""
         draw = torch.rand(self.valid.shape[-1], generator=generator, dtype=torch.float32).to(self.data)
         keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
-        data = self.data.gather(1, keep.unsqueeze(-1).expand(*keep.shape, 3))
-        return self.with_data(data, self.valid.gather(1, keep))
+        return self.kept(keep)
 
-    def with_data(self, data: Tensor, valid: Tensor) -> AlignProblem:
+    def kept(self, index: Tensor) -> Self:
+        """Return the problem with the data (B, C) of an index, that stand for all."""
+        wide = index.unsqueeze(-1).expand(*index.shape, 3)
+        found = self.with_data(self.data.gather(1, wide), self.valid.gather(1, index))
+        return found if self.normals is None else replace(found, normals=self.normals.gather(1, wide))
+
+    def with_data(self, data: Tensor, valid: Tensor) -> Self:
         """Return the problem with a sample of its data (B, M, 3), valid or not (B, M), that stands for all."""
         thinning = self.valid.sum(-1) / valid.sum(-1).clamp_min(1)
         return replace(self, data=data, valid=valid, factors=tuple(each.thinned(thinning) for each in self.factors))
 
-    def with_skin(self, skin: LinearBlendSkin) -> AlignProblem:
+    def with_skin(self, skin: LinearBlendSkin) -> Self:
         """Return the problem with other model points that cover the shape as evenly."""
         return replace(self, skin=skin, factors=tuple(factor.for_skin(skin) for factor in self.factors))
 
@@ -147,18 +148,24 @@ class AlignProblem:
         self, objective: Objective, pose: Tensor, max_steps: int, around: Linearization, damping: Tensor | None = None
     ) -> LMResult:
         """Return the result of Levenberg-Marquardt within the joint limits from a pose with a known linearization."""
-        return levenberg_marquardt(
-            objective, pose, retract=self.skin.shape.retract, lower=self.lower, upper=self.upper,
-            damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
-            start=around, cost=objective.cost,
+        return self.shared.descend(
+            objective, pose, lower=self.lower, upper=self.upper, damping=damping, max_steps=max_steps,
+            atol=self.pose_atol * min(1.0, self.size), start=around, cost=objective.cost,
         )  # fmt: skip
 
     def step(self, around: Linearization, pose: Tensor, damping: float = 1e-3) -> LMResult:
         """Return the result of one damped step without a test: all that a generalized EM needs."""
-        shares = torch.full_like(pose[:, 0], damping)
-        frozen = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step, _ = damped_step(around, shares, frozen=frozen)
-        return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, shares, step, 1)
+        return self.shared.step(around, pose, lower=self.lower, upper=self.upper, damping=damping)
+
+    @property
+    def shared(self) -> SharedRows:
+        """Which unknowns the rows share: none, one by one."""
+        return SharedRows(self.skin.shape.retract)
+
+    def unfinished(self, step: Tensor) -> Tensor:
+        """Return the rows (R,) whose last step (B, num_dofs) was not final, or none, with those that share unknowns."""
+        moves = ~((step != 0).any(-1) & (self.change(step) <= self.pose_atol))
+        return moves.unflatten(0, (-1, self.scans)).any(-1).repeat_interleave(self.scans).nonzero()[:, 0]
 
     def change(self, step: Tensor) -> Tensor:
         """Return the largest change (B,) in a step, radians, or metres as a share of the size."""

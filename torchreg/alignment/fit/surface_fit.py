@@ -67,10 +67,32 @@ def fit_surface(
     noise = surface_noise(distance, problem.valid, problem.size)
     sigma = SURFACE_FIT.width_per_noise * noise
     objective = surface_objective(problem, sigma, noise)
-    around = objective.linearize(pose, distance, jacobian)
-    solved = problem.solve(objective, pose, SURFACE_FIT.last_steps * steps, around)
+    solved = problem.solve(objective, pose, steps, objective(pose, distance, jacobian))
+    for _ in range(SURFACE_FIT.last_steps - 1):
+        index = problem.unfinished(solved.last_step)
+        if len(index) == 0:
+            break
+        solved = _solve_rows(problem, solved, index, sigma, noise, steps)
     report_step(on_step, problem, solved, stage="surface", step=len(widths), num_steps=num_steps, sigma=sigma)
     return StageResult(pose=solved.state, sigma=sigma, change=problem.change(solved.last_step))
+
+
+def _solve_rows(
+    problem: AlignProblem, solved: LMResult, index: Tensor, sigma: Tensor, noise: Tensor, steps: int
+) -> LMResult:
+    """Return the result with more tested steps of some rows."""
+    part, pose = problem.rows(index), solved.state[index]
+    objective = surface_objective(part, sigma[index], noise[index])
+    more = part.solve(objective, pose, steps, objective(pose), solved.damping[index])
+    accepted = (more.last_step != 0).any(-1, keepdim=True)
+    last_step = torch.where(accepted, more.last_step, solved.last_step[index])
+    return LMResult(
+        solved.state.index_copy(0, index, more.state),
+        solved.cost.index_copy(0, index, more.cost),
+        solved.damping.index_copy(0, index, more.damping),
+        solved.last_step.index_copy(0, index, last_step),
+        solved.num_steps + more.num_steps,
+    )
 
 
 @dataclass(frozen=True)
@@ -92,7 +114,7 @@ def refine_surface(problem: AlignProblem, pose: Tensor, *, steps: int, widths: S
     noise = surface_noise(distance, problem.valid, problem.size)
     objective = surface_objective(problem, SURFACE_FIT.width_per_noise * noise, noise)
     for _ in range(SURFACE_FIT.last_steps * steps):
-        around = objective.linearize(pose, distance, jacobian)
+        around = objective(pose, distance, jacobian)
         solved = problem.step(around, pose, SURFACE_FIT.refine_damping)
         pose = solved.state
         distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchreg.alignment.fit.annealed_em import ANNEALING
 from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.fit.problem import AlignProblem, joint_precision
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, take_rows
@@ -23,7 +24,6 @@ class _Fit:
 
     kept: int = 2  # most probable proposals, beside that fitted to matches
     surface_std: float = 0.015  # of where the network says that a datum lies on the shape
-    sigma: float = 0.02  # of a datum about the model point
     reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
     joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
     matched_steps: int = 2  # in each round
@@ -31,7 +31,7 @@ class _Fit:
 
 _FIT = _Fit()
 # From what a proposal errs by to a searched pose's width.
-_PLAN = Plan(widths=(0.05, 0.03, 0.02), steps=2)
+_PLAN = Plan(start=0.05, stop=0.02, steps=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,8 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
 def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
     """Return ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first."""
     coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
-    poses = problem.clamp_candidates(proposals.poses)
-    number = poses.shape[1]
-    wide = problem.repeated(number)
-    wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
-    matched = matched_pose(wide, proposals).reshape(poses.shape)
-    fitted = Candidates.descended(coarse, torch.cat([poses, matched], dim=1), _PLAN).distinct(SEARCH_BUDGET.same, count)
+    pool = torch.cat([problem.clamp_candidates(proposals.poses), matched_pose(problem, proposals).unsqueeze(1)], dim=1)
+    fitted = Candidates.descended(coarse, pool, _PLAN).distinct(SEARCH_BUDGET.same, count)
     return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
 
 
@@ -81,19 +77,15 @@ def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignPro
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
-    """Return poses (B K, num_dofs) after an EM that matches data to model points near their places at rest.
+    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest.
 
-    Of B clouds the problem has K rows each. Pairs of a datum and a model point that rounding cannot tell from none are
-    left out: few are near each other.
+    Pairs of a datum and a model point that rounding cannot tell from none are left out: few are near each other.
     """
-    skin, sigma, pose = problem.skin, _FIT.sigma * problem.size, problem.prior.mean
+    skin, sigma, pose = problem.skin, ANNEALING.stop * problem.size, problem.prior.mean
     near = torch.cdist(proposals.surface, skin.points).square()
     share = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1)
     share, index = share.topk(int((share > torch.finfo(share.dtype).eps).sum(-1).max()), sorted=False)
-    told, index, points = (
-        each.repeat_interleave(len(pose) // len(near), 0)
-        for each in (share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2))
-    )
+    told, index, points = share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2)
     for width in (None, *_FIT.reach):
         weight = told
         if width is not None:

@@ -14,10 +14,11 @@ from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.landmarks import Landmarks, MeasuredKeypoints
 from torchreg.alignment.fit.objectives import Objective
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_problem
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates
-from torchreg.alignment.search.rough_poses import bent_pose, typical_poses
+from torchreg.alignment.search.rough_poses import UniformRotations, typical_poses
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_log, spread_rotations
 from torchreg.result import Status, normal_copy
@@ -30,11 +31,11 @@ from torchreg.shapes.skin import LinearBlendSkin
 class _Search:
     """Numbers of a fit to keypoints alone; lengths are shares of the model's size."""
 
-    rotations: int = 200  # of each typical pose, evenly spread
-    widths: tuple[float, ...] = (0.3, 0.15, 0.08, 0.04)  # by which keypoints may be off beside their own errors
-    near_widths: tuple[float, ...] = (0.08, 0.04)  # the same from a pose that is given
-    fine_widths: tuple[float, ...] = (0.02, 0.01, 0.005)  # of the best candidates
-    steps: int = 3  # at each width
+    start: float = 0.3  # by which keypoints may be off beside their own errors, from poses all around
+    near: float = 0.08  # the same from a pose that is given
+    ranked: float = 0.04  # the same where the best candidates are taken
+    stop: float = 0.005  # the same of these in the end
+    steps: int = 2  # at each width
     refined: int = 24  # best candidates, of which each is refined
     refine_steps: int = 15
     joint_std: float = 0.4  # of a weak prior about a typical pose, radians
@@ -70,7 +71,7 @@ class KeypointRows:
             raise InputError(f"keypoints alone must be of one frame, (K, 2) or (K, 3), got {got}")
         shape = skin.shape
         origin = _center(shape, measured)[None]
-        near = bent_pose(shape, 0.5) if start is None else start[0]
+        near = typical_poses(shape).mean(0) if start is None else start[0]
         problem = centered_problem(
             skin, origin.unsqueeze(1), torch.zeros_like(origin[:, :1], dtype=torch.bool), near[None], origin,
             prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
@@ -80,7 +81,7 @@ class KeypointRows:
             problem = known.with_prior(problem, shifted(given[None], -origin))
         pool = _all_around(problem) if start is None else shifted(start, -origin)
         pool = problem.clamp_candidates(pool[None])[0]
-        widths = _SEARCH.widths if start is None else _SEARCH.near_widths
+        widths = narrowing(_SEARCH.start if start is None else _SEARCH.near, _SEARCH.ranked)
         return cls(problem, pool, widths, costs=pool[:, 0], lead=pool[0, 0])
 
     def annealed(self) -> KeypointRows:
@@ -91,7 +92,7 @@ class KeypointRows:
 
     def fitted(self) -> KeypointRows:
         """Return the rows fitted down to the keypoints' own errors alone."""
-        pool = _descended(self.problem, self.poses, _SEARCH.fine_widths)
+        pool = _descended(self.problem, self.poses, narrowing(_SEARCH.ranked, _SEARCH.stop))
         wide = self.problem.repeated(len(pool))
         objective = _objective(wide, 0.0)
         poses = wide.solve(objective, pool, _SEARCH.refine_steps, objective(pool)).state
@@ -158,7 +159,7 @@ def _center(shape: Articulation, measured: MeasuredKeypoints) -> Tensor:
     middle = targets.median(0).values
     if measured.camera is None:
         return middle.to(shape.rest)
-    points = shape.keypoints(bent_pose(shape, 0.5)).double()
+    points = shape.keypoints(typical_poses(shape).mean(0)).double()
     spread = (points - points.median(0).values).norm(dim=-1).median()
     seen = (targets - middle).norm(dim=-1).median().clamp_min(1.0)
     depth = measured.camera.intrinsics[:2].mean().double() * spread / seen
@@ -168,8 +169,8 @@ def _center(shape: Articulation, measured: MeasuredKeypoints) -> Tensor:
 def _all_around(problem: AlignProblem) -> Tensor:
     """Return typical poses at evenly spread rotations about the origin (S, num_dofs)."""
     shape = problem.skin.shape
-    poses = typical_poses(shape).repeat_interleave(_SEARCH.rotations, 0)
-    turns = so3_log(spread_rotations(_SEARCH.rotations).to(poses))
+    poses = typical_poses(shape).repeat_interleave(UniformRotations.count, 0)
+    turns = so3_log(spread_rotations(UniformRotations.count).to(poses))
     poses[:, 3:BASE_DOFS] = turns.repeat(len(poses) // len(turns), 1)
     return shifted(poses, -shape.keypoints(poses).mean(-2))
 
@@ -177,7 +178,7 @@ def _all_around(problem: AlignProblem) -> Tensor:
 def _objective(wide: AlignProblem, width: float) -> Objective:
     """Return the likelihood of the keypoints and the prior, at a width in metres."""
     sigma = torch.full_like(wide.prior.mean[:, 0], width)
-    return Objective(None, wide.factors, wide.prior, sigma, sigma)
+    return Objective((*wide.factors, wide.prior), sigma, sigma)
 
 
 def _descended(problem: AlignProblem, pool: Tensor, widths: tuple[float, ...]) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.fit.problem import BALL_AXES, PRIOR_SHARE, AlignProblem
-from torchreg.alignment.search.multi_start import distinct_first, rows_in_memory, take_rows
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, distinct_first, rows_in_memory, take_rows
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.articulation import Articulation
@@ -56,7 +56,6 @@ class _Placement:
     near_shares: float = 3.0  # data near its root that a limb is tried on, as multiples of its share among all limbs
     min_loss: float = 0.02  # of a datum, so that those which the trunk explains count as far from the root
     same: float = 0.25  # configurations of a limb whose joints all differ by less are duplicates, radians
-    noise: float = 0.006  # standard deviation of the data for the weight of the prior, as a share of the model's size
     max_step: float = 0.3  # of a joint, radians or metres
 
 
@@ -280,7 +279,7 @@ class _Search:
         precision = precision.reshape(-1, 1, len(dofs))
         # The data of the subset count for all.
         share = self.problem.valid.sum(-1).to(losses) / self.subset.valid.sum(-1).clamp_min(1)
-        noise = _PLACEMENT.noise * problem.size
+        noise = SEARCH_BUDGET.noise * problem.size
         weights = (losses * problem.valid.unsqueeze(1)) * (share / noise**2)[:, None, None]
         lower, upper = (limit.expand_as(poses[:, 0])[:, None, dofs] for limit in (problem.lower, problem.upper))
         for width in self.effort.refine_widths:

@@ -39,15 +39,13 @@ class _Scatter:
     turn: float = 0.17  # of the base, radians
     shift: float = 0.035  # of the base, as a share of the model's size
     redrawn_limbs: float = 0.25  # share of the limbs that are drawn uniformly
-    redrawn_reach: float = 1.2  # of the joints of such a limb from the pose, radians or metres
-    known_reach: float = 3.0  # standard deviations of what is known beforehand, for those joints: beyond lies 1 in 400
+    reach: float = 3.0  # standard deviations of the joints of such a limb, at most: beyond lies 1 in 400
 
 
 @dataclass(frozen=True)
 class _Around:
     """Numbers of the search all around a start."""
 
-    fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
 
@@ -121,7 +119,7 @@ def _search_around(
         _scatter(search.problem, search.limbs.limbs, center, max(1, candidates // 2), generator)
         for center in (start, best)
     ]
-    pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1), _AROUND.fit_steps)
+    pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1))
     placed = search.prune(pool[:, : max(1, round(_AROUND.placed_share * pool.shape[1]))], _AROUND.num_refined)
     poses, scores = search.refine(placed[:, :1], rounds)
     found, value = poses[:, 0], scores[:, 0]
@@ -145,9 +143,10 @@ def _scatter(
     noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
     around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)
-    lower, upper = problem.plausible_limits(_SCATTER.known_reach)
-    span = (upper - lower).clamp_max(2 * _SCATTER.redrawn_reach)
-    low = torch.minimum(torch.maximum(center - _SCATTER.redrawn_reach, lower), upper - span)
+    lower, upper = problem.plausible_limits(_SCATTER.reach)
+    reach = _SCATTER.reach * _SCATTER.max_joints
+    span = (upper - lower).clamp_max(2 * reach)
+    low = torch.minimum(torch.maximum(center - reach, lower), upper - span)
     redrawn = low.unsqueeze(1) + span.unsqueeze(1) * torch.rand(
         noise.shape, generator=generator, dtype=torch.float32
     ).to(center)

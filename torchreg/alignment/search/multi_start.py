@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, alignment_cost
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface_steps
 from torchreg.solvers.robust import welsch_loss
 
@@ -23,9 +24,8 @@ class SearchBudget:
     num_data: int = 800  # of the refinement: more tell candidates apart no better
     num_coarse_data: int = 250  # of the coarse fits and the pruning of many candidates
     num_model_points: int = 120  # that cover the shape
-    num_compared: int = 60  # model points by which candidates are compared
-    same: float = 0.05  # fitted poses whose points differ by less are one
-    alike: float = 0.045  # the same of rough poses
+    same: float = 0.05  # poses whose points differ by less are one
+    duplicate: float = 0.005  # poses whose points differ by less descend to the same one
     max_ranked: int = 400  # best candidates, of which different ones are taken
     noise: float = 0.01  # standard deviation of the data for the weight of the prior
     cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
@@ -37,11 +37,11 @@ SEARCH_BUDGET = SearchBudget()
 
 @dataclass(frozen=True)
 class Plan:
-    """Damped steps at each of some kernel widths, then a score at one width, all shares of the model's size."""
+    """Damped steps at each of narrowing kernel widths, then a score at the last, all shares of the model's size."""
 
-    widths: tuple[float, ...]
+    start: float
+    stop: float
     steps: int
-    score_width: float = 0.022
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +103,9 @@ def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, T
 
     def descent(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
         noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
-        for width in plan.widths:
+        for width in narrowing(plan.start, plan.stop):
             pose = surface_steps(part, pose, torch.full_like(noise, width * problem.size), noise, plan.steps).state
-        return pose, score_candidates(part, pose.unsqueeze(1), plan.score_width)[:, 0]
+        return pose, score_candidates(part, pose.unsqueeze(1), plan.stop)[:, 0]
 
     return _few_at_a_time(descent, problem, poses)
 
@@ -113,12 +113,17 @@ def descend(problem: AlignProblem, poses: Tensor, plan: Plan) -> tuple[Tensor, T
 def _few_at_a_time(
     evaluate: Callable[[AlignProblem, Tensor], tuple[Tensor, Tensor]], problem: AlignProblem, poses: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return poses (B, K, num_dofs) and costs (B, K), evaluated for few candidates at a time."""
+    """Return poses (B, K, num_dofs) and costs (B, K), evaluated for few candidates at a time, duplicates once."""
+    close = mean_distances(problem, poses) <= SEARCH_BUDGET.duplicate * problem.size
+    original = first_close(close)
+    cloud, number = (original == torch.arange(poses.shape[1], device=poses.device)).nonzero(as_tuple=True)
     # The wrenches of all parts on all data are the largest table of a Jacobian.
-    pose, wrenches = poses.flatten(0, 1), 6 * problem.data.shape[1] * problem.skin.shape.num_parts
-    rows = rows_in_memory(len(pose), wrenches, pose.device)
-    found, costs = zip(*(evaluate(problem.rows(row // poses.shape[1]), pose[row]) for row in rows), strict=True)
-    return torch.cat(found).reshape(poses.shape), torch.cat(costs).reshape(poses.shape[:2])
+    wrenches = 6 * problem.data.shape[1] * problem.skin.shape.num_parts
+    found, costs = poses.clone(), torch.zeros_like(poses[..., 0])
+    for rows in rows_in_memory(len(cloud), wrenches, poses.device):
+        index = cloud[rows], number[rows]
+        found[index], costs[index] = evaluate(problem.rows(index[0]), poses[index])
+    return take_rows(found, original), costs.gather(1, original)
 
 
 def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
@@ -145,13 +150,13 @@ def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torc
         pose = fit_surface(part, pose, steps=settings.surface_steps).pose
         costs = alignment_cost(part, pose).unflatten(0, (-1, candidates))
         ranked = Candidates.ranked(drawn.rows(rows), pose.unflatten(0, (-1, candidates)), costs)
-        found.append(ranked.distinct(SEARCH_BUDGET.alike, count).poses)
+        found.append(ranked.distinct(SEARCH_BUDGET.same, count).poses)
     return torch.cat(found)
 
 
 def mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
     """Return the distances (B, K, K) of model points, as root mean squares, between poses (B, K, num_dofs)."""
-    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_compared), :]
+    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_model_points), :]
     return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
 
 
@@ -166,9 +171,15 @@ def take_rows(table: Tensor, index: Tensor) -> Tensor:
     return table.gather(1, index.reshape(*index.shape, *[1] * (table.ndim - 2)).expand(*index.shape, *table.shape[2:]))
 
 
-def distinct_first(close: Tensor) -> Tensor:
-    """Return the order (B, K) that moves items to the end that are close (B, K, K) to an item kept before them."""
+def first_close(close: Tensor) -> Tensor:
+    """Return for each item (B, K) which item it is close (B, K, K) to of those before it that are kept, or itself."""
     kept = torch.ones_like(close[..., 0])
     for rank in range(1, close.shape[-1]):
         kept[:, rank] = ~(close[:, rank, :rank] & kept[:, :rank]).any(-1)
-    return kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)
+    return (close & kept.unsqueeze(1)).to(torch.uint8).argmax(-1)
+
+
+def distinct_first(close: Tensor) -> Tensor:
+    """Return the order (B, K) that moves items to the end that are close (B, K, K) to an item kept before them."""
+    is_later = first_close(close) != torch.arange(close.shape[-1], device=close.device)
+    return is_later.to(torch.uint8).argsort(dim=1, stable=True)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.search.limb_search import Effort, LimbSearch
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, descend, take_rows
 from torchreg.geometry.sampling import farthest_points
@@ -29,7 +30,6 @@ class _Stage:
 class _Search:
     """Numbers of the search; lengths are shares of the model's size."""
 
-    same: float = 0.005  # candidates whose points differ by less are duplicates
     min_gain: float = 0.5  # in data explained: a round that gains less is the last
 
 
@@ -38,16 +38,16 @@ _PRUNE = _Stage(
         num_data=150, width=0.05, beam=82, configurations=41, refine_widths=(), score_width=0.05, combinations=2,
         exchanged=0,
     ),
-    plan=Plan(widths=(0.04, 0.03, 0.025), steps=1),
+    plan=Plan(start=0.04, stop=0.022, steps=1),
 )  # fmt: skip
 _REFINE = _Stage(
     effort=Effort(
-        num_data=250, width=0.05, beam=123, configurations=40, refine_widths=_PRUNE.plan.widths, score_width=0.02,
+        num_data=250, width=0.05, beam=123, configurations=40, refine_widths=narrowing(0.04, 0.022), score_width=0.02,
         combinations=8, exchanged=3,
     ),
-    plan=Plan(widths=(0.03, 0.022, 0.018), steps=2, score_width=0.018),
+    plan=Plan(start=0.03, stop=0.018, steps=2),
 )  # fmt: skip
-_COARSE = Plan(widths=(0.12, 0.08, 0.05, 0.03, 0.018), steps=3)
+_COARSE = Plan(start=0.12, stop=0.018, steps=3)
 _SEARCH = _Search()
 
 
@@ -76,14 +76,14 @@ class PoseSearch:
         """Return the scores (B,) of poses (B, num_dofs) after a fit without any search, comparable to `refine`'s."""
         return descend(self.problem, poses.unsqueeze(1), _REFINE.plan)[1][:, 0]
 
-    def fit_coarsely(self, pool: Tensor, steps: int) -> Tensor:
+    def fit_coarsely(self, pool: Tensor) -> Tensor:
         """Return candidates (B, N, num_dofs) after surface fits of narrowing kernels, best and different ones first."""
-        fitted = Candidates.descended(self.coarse_problem, pool, replace(_COARSE, steps=steps))
-        return fitted.distinct(_SEARCH.same).poses
+        fitted = Candidates.descended(self.coarse_problem, pool, _COARSE)
+        return fitted.distinct(SEARCH_BUDGET.duplicate).poses
 
     def prune(self, pool: Tensor, count: int) -> Tensor:
         """Return the best, different ``count`` of candidates (B, N, num_dofs), limbs placed anew or as given."""
-        return self._best_options(self.coarse_problem, pool, _PRUNE, 0).distinct(_SEARCH.same, count).poses
+        return self._best_options(self.coarse_problem, pool, _PRUNE, 0).distinct(SEARCH_BUDGET.duplicate, count).poses
 
     def refine(self, candidates: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
         """Return candidates (B, H, num_dofs) after a thorough search, best first, and their scores (B, H)."""

@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from torchreg._checks import check_count, check_direction
 from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import rotation_between, so3_exp, so3_log, spread_rotations
 from torchreg.geometry.sampling import farthest_points
@@ -25,11 +26,12 @@ from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
 class _RigidEM:
     """Numbers of the rigid registration of rough poses; widths are shares of the model's size."""
 
-    widths: tuple[float, ...] = (0.14, 0.14, 0.1, 0.1, 0.07, 0.07, 0.07, 0.05, 0.05, 0.05)  # sigma of each EM step
+    start: float = 0.13  # first sigma
+    stop: float = 0.05  # last sigma, and that of the kernel in the cost
+    steps: int = 3  # at each sigma
     num_points: int = 60  # model points
     num_data: int = 120  # drawn per cloud
     outlier: float = 0.3  # as a share of the usual outlier constant, since few model points share a datum
-    score_width: float = 0.05  # sigma of the kernel in the cost
     model_weight: float = 0.5  # in the cost, of model points far from the data, beside that of data far from the model
 
 
@@ -108,13 +110,9 @@ DEFAULT_SOURCES: tuple[PoseSource, ...] = (UniformRotations(), PrincipalAxes())
 
 def typical_poses(shape: Articulation) -> Tensor:
     """Return (K, num_dofs) different poses between the rest pose and the middle of the joint limits."""
-    return torch.stack([bent_pose(shape, share) for share in _BENT_SHARES]).unique(dim=0)
-
-
-def bent_pose(shape: Articulation, share: float) -> Tensor:
-    """Return the pose (num_dofs,) at a share of the way from the rest pose to the middle of the joint limits."""
     middle = 0.5 * (shape.lower + shape.upper)
-    return shape.rest + share * torch.where(middle.isfinite(), middle - shape.rest, 0.0)
+    way = torch.where(middle.isfinite(), middle - shape.rest, 0.0)
+    return torch.stack([shape.rest + share * way for share in _BENT_SHARES]).unique(dim=0)
 
 
 def _principal_axes(points: Tensor, weights: Tensor) -> Tensor:
@@ -140,7 +138,8 @@ def register_rigidly(problem: AlignProblem, poses: Tensor, generator: torch.Gene
     points = skin(poses)[..., farthest_points(skin.points, min(_RIGID_EM.num_points, len(skin))), :]
     moved, motion = points, torch.eye(4).to(points).expand(*poses.shape[:2], 4, 4)
     data, mask = drawn.data.unsqueeze(1), drawn.valid.unsqueeze(1)
-    for width in () if _has_fixed_base(problem) else _RIGID_EM.widths:
+    widths = () if _has_fixed_base(problem) else narrowing(_RIGID_EM.start, _RIGID_EM.stop)
+    for width in (width for width in widths for _ in range(_RIGID_EM.steps)):
         outlier = _RIGID_EM.outlier * OUTLIER_CONSTANT
         matches = expectation(moved, data, moved.new_tensor(width * size), outlier, mask=mask)
         motion = fit_rigid(points, matches.targets, matches.weights)
@@ -158,7 +157,7 @@ def _has_fixed_base(problem: AlignProblem) -> bool:
 def closeness(points: Tensor, problem: AlignProblem, size: float) -> tuple[Tensor, Tensor]:
     """Return how near data are to points (B, K, N, 3), and points to data, (B, K, M) and (B, K, N), from 0 to 1."""
     data, valid = problem.data.unsqueeze(1), problem.valid.to(points)[:, None, None]
-    kernel = _kernel(points, data, _RIGID_EM.score_width * size / math.sqrt(2)) * valid
+    kernel = _kernel(points, data, _RIGID_EM.stop * size / math.sqrt(2)) * valid
     return kernel.amax(-2), kernel.amax(-1)
 
 

@@ -77,7 +77,7 @@ class PersonRows:
         views = [frame.camera.position for frame in task.seen.frames]
         viewpoints = torch.stack(views) if views else None
         problem, start = shape_problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
-        coarse = problem.sample(SHAPE_FIT.coarse_data, generator)
+        coarse = problem.draw(SHAPE_FIT.coarse_data, generator)
         return cls(task, problem, coarse, start, generator, sigma=start[:1, 0])
 
     def record(self, step: AlignRecord) -> None:
@@ -115,7 +115,7 @@ class PersonRows:
 
     def finished(self) -> FoundPerson:
         """Return the person fitted to more and more data, with the deviations of alike coefficients learned."""
-        fine = self.problem.sample(SHAPE_FIT.fine_data, self.generator)
+        fine = self.problem.draw(SHAPE_FIT.fine_data, self.generator)
         state = self._fit(fine, self.state, SHAPE_FIT.fine_steps).pose
         problem, alike = self.problem, self.task.shape.coefficient_space().alike
         if alike is not None:
@@ -185,7 +185,7 @@ class PersonRows:
         one = rows.problem.rows(self.problem.people(torch.zeros(1, dtype=torch.int64)))
         worn = rows.state[:1, -CLOTH.num_modes :]
         state = torch.cat([bare.fitted.state, worn], dim=-1)
-        if not are_clothes_likelier(one.sample(SHAPE_FIT.fine_data, self.generator), state, self._fitted_closely):
+        if not are_clothes_likelier(one.draw(SHAPE_FIT.fine_data, self.generator), state, self._fitted_closely):
             return bare
         return rows.annealed().fitted().restarted().finished()
 
@@ -198,7 +198,7 @@ class PersonRows:
         space, dofs = self.task.shape.coefficient_space(), self.task.shape.num_dofs
         member = alike.unsqueeze(-1) == alike.clamp_min(0).unique()
         group = member.to(state)
-        for _ in range(SHAPE_FIT.spread_steps):
+        for _ in range(SHAPE_FIT.fine_steps):
             precision = problem.prior.precision[dofs:] * problem.scans
             covariance = shared_covariance(noise_covariance(problem, state), dofs)
             told = (1 - covariance.diagonal() * precision).clamp(0, 1)

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchreg.alignment.evidence.clusters import CLUSTERS
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.search.limb_search import joint_samples
-from torchreg.alignment.search.multi_start import Candidates
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates
 from torchreg.alignment.search.rough_poses import (
+    UniformRotations,
     UprightRotations,
     closeness,
     register_rigidly,
@@ -33,12 +34,10 @@ from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 class _PersonSearch:
     """Numbers of the search."""
 
-    num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
     duplicate_limb_rms: float = 0.03  # the same, of states that differ in one limb only
     turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
     most_swung: float = 0.5  # of the surface: a limb that is more is not swung, as the rest would be
-    num_points: int = 250  # model points, and data, by which swung parts are ranked
     num_data: int = 500
 
 
@@ -58,7 +57,7 @@ def find_people(
     Coefficients (S, K) in evenly spread or upright rotations are registered rigidly, and ranked by unexplained data and
     surface.
     """
-    turns = spread_rotations(_SEARCH.num_rotations) if upright is None else UprightRotations(upright).rotations(rig.up)
+    turns = spread_rotations(UniformRotations.count) if upright is None else UprightRotations(upright).rotations(rig.up)
     rotations = so3_log(turns).to(people)
     joints = typical_poses(rig)
     grid = (len(people), len(joints), len(rotations))
@@ -78,7 +77,8 @@ def limb_restarts(problem: ShapeProblem, state: Tensor, count: int, generator: t
     """Return a state (D + K,) with one limb re-initialized over its joints' ranges, (count, D + K), best first."""
     rig, mean, size = problem.skin.shape.rig, problem.prior.mean[0], problem.size
     bodies, drawn = find_bodies(rig), problem.draw(_SEARCH.num_data, generator)
-    skin = problem.skin.subset(farthest_points(problem.skin.points, min(_SEARCH.num_points, len(problem.skin))))
+    num_points = min(SEARCH_BUDGET.num_coarse_data, len(problem.skin))
+    skin = problem.skin.subset(farthest_points(problem.skin.points, num_points))
     owner, points = skin.weights.argmax(-1), skin(state)[None, None]
     swung, costs = [], []
     for limb in find_limbs(rig)[0]:

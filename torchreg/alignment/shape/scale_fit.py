@@ -8,14 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchreg.alignment.fit.objectives import Objective, SurfaceDistances
 from torchreg.alignment.fit.problem import masked_mean
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.scale_jacobian import SCALE_RANGE, scale_jacobian
-from torchreg.solvers.arrow import join_shared
-from torchreg.solvers.levenberg_marquardt import Linearization
-from torchreg.solvers.robust import welsch_loss, welsch_weight
+from torchreg.solvers.arrow import SharedRows
+from torchreg.solvers.levenberg_marquardt import Linearization, LMResult
+from torchreg.solvers.robust import welsch_loss
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,6 @@ class ScaleFit:
     """Numbers of a joint fit."""
 
     shared_error: float = 1.5  # factor on the noise: neighboring residuals share the error of the shape's surface
-    last_steps: int = 2  # at the last width, as a multiple of those at the others
 
 
 SCALE_FIT = ScaleFit()
@@ -65,22 +65,24 @@ class ScalePrior:
         precision = covariance.inverse().to(scales)
         return cls(poses=poses, pose_precision=pose_precision, scales=scales, scale_precision=precision)
 
-    def add_to(self, problem: Linearization, poses: Tensor, scales: Tensor) -> Linearization:
-        """Return the problem of one state, as a batch of one, with the prior added."""
-        joints = (poses - self.poses).flatten()
-        precision = self.pose_precision.expand_as(poses).flatten()
-        offset = scales - self.scales
-        gradient = torch.cat([precision * joints, self.scale_precision @ offset])
-        cost = 0.5 * gradient @ torch.cat([joints, offset])
-        curvature = torch.block_diag(precision.diag(), self.scale_precision)
-        return Linearization(problem.cost + cost, problem.gradient + gradient, problem.hessian + curvature)
+    def linearized(self, state: Tensor, *_kernel: Tensor) -> Linearization:
+        """Return cost, gradient and Hessian at rows (T, num_dofs + 2 P), each with its share of that of the scales."""
+        count = self.poses.shape[-1]
+        precision = torch.block_diag(self.pose_precision.diag(), self.scale_precision / len(state))
+        offset = torch.cat([state[:, :count] - self.poses, state[:, count:] - self.scales], dim=-1)
+        gradient = offset @ precision
+        return Linearization(0.5 * (gradient * offset).sum(-1), gradient, precision.expand(len(state), -1, -1))
+
+    def cost(self, state: Tensor, *_kernel: Tensor) -> Tensor:
+        """Return the cost alone (T,)."""
+        return self.linearized(state).cost
 
 
 class ScaleProblem:
     """The poses of all frames and the scales of the shape as one least-squares problem.
 
-    A state is one row: the poses of all frames, lengths, radii. The shape carries the scales of the last state
-    evaluated. At most ``max_points`` of each frame's data (T, M, 3) count.
+    A state is a row for each frame, (T, num_dofs + 2 P): its pose, then lengths and radii, which all share. The shape
+    carries the scales of the last state evaluated. At most ``max_points`` of each frame's data (T, M, 3) count.
     """
 
     def __init__(
@@ -95,56 +97,51 @@ class ScaleProblem:
         self.data, self.valid = torch.where(valid.unsqueeze(-1), data - mean.unsqueeze(1), 0.0), valid
         self.shift = pad(mean, (0, shape.num_dofs - 3))
         self.prior = replace(prior, poses=prior.poses - self.shift)
-        self.lower = torch.cat([(shape.lower - self.shift).flatten(), prior.scales - SCALE_RANGE.max_log])
-        self.upper = torch.cat([(shape.upper - self.shift).flatten(), prior.scales + SCALE_RANGE.max_log])
 
     def state(self, poses: Tensor) -> Tensor:
-        """Return the state (1, T num_dofs + 2 P) of poses and of the shape as it is."""
-        scales = self.shape.log_length_scales, self.shape.log_radius_scales
-        return torch.cat([(poses - self.shift).flatten(), *scales]).unsqueeze(0)
+        """Return the state of poses (T, num_dofs) and of the shape as it is."""
+        return self._rows(poses, torch.cat([self.shape.log_length_scales, self.shape.log_radius_scales]))
 
-    def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return poses (T, num_dofs) about the frames' means, and scales (2 P,)."""
-        poses, scales = state[0].tensor_split([self.shift.numel()])
-        return poses.reshape(self.shift.shape), scales
+    def _rows(self, poses: Tensor, scales: Tensor) -> Tensor:
+        return torch.cat([poses - self.shift, scales.expand(len(self.shift), -1)], dim=-1)
 
-    def set_scales(self, scales: Tensor) -> None:
-        """Give the shape these lengths and radii (2 P,)."""
-        lengths, radii = scales.chunk(2)
+    def carried(self, state: Tensor) -> Tensor:
+        """Return the poses (T, num_dofs) about the frames' means of a state, whose scales the shape carries then."""
+        poses, scales = state.tensor_split([self.shape.num_dofs], dim=-1)
+        lengths, radii = scales[0].chunk(2)
         self.shape.log_length_scales.copy_(lengths)
         self.shape.log_radius_scales.copy_(radii)
+        return poses
 
-    def retract(self, state: Tensor, step: Tensor) -> Tensor:
-        """Return the state moved by a step; base rotations are updated by composition."""
-        (poses, scales), (move, growth) = self.split(state), self.split(step)
-        return torch.cat([self.shape.retract(poses, move).flatten(), scales + growth]).unsqueeze(0)
+    def distance(self, points: Tensor, state: Tensor) -> Tensor:
+        """Return the distances (T, M) of points (T, M, 3), see `ShapeSurface`."""
+        return self.shape.distance(points, self.carried(state))
 
-    def change(self, step: Tensor) -> Tensor:
+    def distance_jacobian(self, points: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances and their Jacobian (T, M, num_dofs + 2 P), see `ShapeSurface`."""
+        poses = self.carried(state)
+        distance, by_pose = self.shape.distance_jacobian(points, poses, chart="tangent")
+        return distance, torch.cat([by_pose, scale_jacobian(self.shape, points, poses)], dim=-1)
+
+    def solve(self, state: Tensor, sigma: float, noise: float, max_steps: int, atol: float) -> LMResult:
+        """Return the state after Levenberg-Marquardt with a kernel width and a noise, metres."""
+        sigmas, noises = (torch.full_like(state[:, 0], value) for value in (sigma, noise))
+        terms = SurfaceDistances(self, self.data, self.valid, SURFACE_FIT.lever * self.size), self.prior
+        lower = self._rows(self.shape.lower, self.prior.scales - SCALE_RANGE.max_log)
+        upper = self._rows(self.shape.upper, self.prior.scales + SCALE_RANGE.max_log)
+        return SharedRows(self.shape.retract, len(state), self.shape.num_dofs).descend(
+            Objective(terms, sigmas, noises), state, lower=lower, upper=upper, max_steps=max_steps, atol=atol
+        )
+
+    def change(self, step: Tensor) -> float:
         """Return the largest change in a step, radians, metres as a share of the size, or logarithms of scales."""
-        move, growth = self.split(step)
-        return torch.cat([(move[:, :3] / self.size).flatten(), move[:, 3:].flatten(), growth]).abs().max()
+        return float(torch.cat([step[:, :3] / self.size, step[:, 3:]], dim=-1).abs().max())
 
     def noise(self, state: Tensor) -> float:
         """Return the robust standard deviation of the data of all frames near the surface, metres."""
-        poses, scales = self.split(state)
-        self.set_scales(scales)
-        return float(surface_noise(self.shape.distance(self.data, poses).flatten(), self.valid.flatten(), self.size))
+        return float(surface_noise(self.distance(self.data, state).flatten(), self.valid.flatten(), self.size))
 
     def unexplained(self, poses: Tensor) -> Tensor:
         """Return the number of data (T,), softly counted, off the surface of the shape as it is in some poses."""
         distance = self.shape.distance(self.data, poses - self.shift)
         return (welsch_loss((distance / (SURFACE_FIT.widths[-1] * self.size)).square()) * self.valid).sum(-1)
-
-    def linearize(self, state: Tensor, sigma: float, noise: float) -> Linearization:
-        """Return the Welsch cost of all distances and its Gauss-Newton approximation; the batch is one state."""
-        poses, scales = self.split(state)
-        self.set_scales(scales)
-        distance, by_pose = self.shape.distance_jacobian(self.data, poses, chart="tangent")
-        jacobian = torch.cat([by_pose, scale_jacobian(self.shape, self.data, poses)], dim=-1)
-        beta = welsch_weight((distance / sigma).square())
-        cost = 0.5 * (sigma / noise) ** 2 * ((1 - beta) * self.valid).sum(-1)
-        weighted = jacobian * (beta * self.valid / noise**2).unsqueeze(-1)
-        rows = Linearization(cost, (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1), weighted.mT @ jacobian)
-        # Poses of different frames meet in the scales only.
-        joined = join_shared(Linearization(*(value.unsqueeze(0) for value in rows)), poses.shape[-1])
-        return self.prior.add_to(joined, poses, scales)

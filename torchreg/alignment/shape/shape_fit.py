@@ -50,7 +50,6 @@ class ShapeFit:
     coarse_steps: int = 3  # at each width of the surface fit
     fine_steps: int = 4
     em_steps: int = 6  # values of sigma
-    spread_steps: int = 4  # after which a learned deviation of coefficients hardly changes
     num_swung: int = 2  # people with a limb swung who are fitted: the first was right in all that were looked at
     again: float = 0.06  # first sigma of the second annealing, as a share of the size
 
@@ -187,7 +186,7 @@ def _found(
     problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator, upright: Direction | None
 ) -> tuple[ShapeProblem, Tensor]:
     """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
-    one = problem.rows(torch.zeros(1, dtype=torch.int64)).sample(SHAPE_FIT.coarse_data, generator)
+    one = problem.rows(torch.zeros(1, dtype=torch.int64)).draw(SHAPE_FIT.coarse_data, generator)
     states = find_people(one, rig, people, SHAPE_FIT.num_found, generator, upright)
     return problem.rows(torch.zeros(len(states), dtype=torch.int64)), states
 
