@@ -109,7 +109,7 @@ class SurfaceGrid:
         return full.to(self.frame.depth.device) & self.frame.measured
 
 
-def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFrame]]:
+def candidate_crops(frame: DepthFrame, size: float) -> Iterator[DepthFrame]:
     """Yield the crops of a frame that may show a shape of some size, metres, surface by surface, nearer ones first.
 
     A surface of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach
@@ -127,7 +127,8 @@ def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFr
         index = (component == number).nonzero()[:, 0]
         if float(_extent(grid.points[index])) < SEGMENTATION.least * size:
             continue
-        yield (frame.cropped(grid.mask(kept)) for kept in _parts(grid, index, size))
+        for kept in _parts(grid, index, size):
+            yield frame.cropped(grid.mask(kept))
         num_surfaces += 1
         if num_surfaces == SEGMENTATION.max_surfaces:
             return
