@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
@@ -67,7 +68,7 @@ def surest_crop(
     answer: Callable[[LikelyCrop], Answer],
     proposer: PoseProposer | None,
 ) -> tuple[Answer, LikelyCrop]:
-    """Return the answer of highest confidence for the likely crops of a frame, and that crop.
+    """Return the answer to the crop of a frame that most probably shows a shape, and that crop.
 
     At most one crop shows the shape: others are tried while they may do so, by the odds of all of them.
     """
@@ -77,7 +78,7 @@ def surest_crop(
     left = total - 1
     for crop in crops:
         found = answer(crop)
-        if best is None or _confidence(found) > _confidence(best[0]):
+        if best is None or _worth(found, crop) > _worth(*best):
             best = found, crop
         left -= crop.odds
         if _shown(found) >= CHOICE.shown or left < CHOICE.missed * total:
@@ -96,6 +97,14 @@ def _not_found_if_improbable(found: AlignResult) -> AlignResult:
     reason = f"not found in the picture: the best pose is wrong with a probability of {1 - confidence:.1%}"
     doubts = [reason, found.doubt] if isinstance(found.doubt, str) and found.doubt else [reason]
     return replace(found, status=Status.NOT_FOUND, doubt="; ".join(doubts))
+
+
+def _worth(found: Any, crop: LikelyCrop) -> float:
+    """Return by what crops are compared: the odds of the better pose in a network's window, or the confidence."""
+    if crop.start is None or not isinstance(found, AlignResult):
+        return _confidence(found)
+    shown = min(_shown(found), 1 - torch.finfo(torch.float32).eps)
+    return max(crop.odds, shown / (1 - shown))
 
 
 def _confidence(found: Any) -> float:
