@@ -130,6 +130,8 @@ def align(
         skin = task.skin()
 
         def aligned(crop: DepthFrame, *, config: AlignConfig, start: Tensor | None = None) -> AlignResult:
+            # What is known holds of what is found, not of a start.
+            start = start if known is None else None
             asked = replace(task, model_points=skin, config=config, start=start, in_picture=True)
             return _aligned(asked, crop, **options)
 
