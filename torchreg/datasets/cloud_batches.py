@@ -189,7 +189,8 @@ class _Draw:
             there = ((self.uniform(batch, 1) < share) | (absent & is_part)) & is_part
             often = self.between(_VARIETY.extra_points, batch, 1) * count / points.shape[1]
             parts.append((points, facing, torch.where(there, often, 0.0).expand(-1, points.shape[1])))
-        return _Scene(*(torch.cat(part, dim=1) for part in zip(*parts, strict=True)), is_window)
+        oriented, facing, often = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
+        return _Scene(oriented, facing, often, is_window)
 
     def inside(self, scene: _Scene, weight: Tensor, middle: Tensor) -> Tensor:
         """Return which points (B, N) of scenes are in windows about middles (B, 3), all where the window is empty."""

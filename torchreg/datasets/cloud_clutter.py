@@ -70,11 +70,9 @@ class Clutter:
     def _things(self, half: Tensor, middle: Tensor) -> Oriented:
         """Return boxes, cans and balls about middles (B, 3) with half their sides (B, 3), turned at random."""
         kinds = [self._boxes(half), self._cans(half), self._balls(half)]
-        kind = (len(kinds) * self._uniform(len(half), 1, 1)).long().clamp_max(len(kinds) - 1)
-        points, normals = (
-            sum(torch.where(kind == number, values, 0.0) for number, values in enumerate(each))
-            for each in zip(*kinds, strict=True)
-        )
+        kind = (len(kinds) * self._uniform(len(half))).long().clamp_max(len(kinds) - 1)
+        rows = torch.arange(len(half), device=half.device)
+        points, normals = (torch.stack(each)[kind, rows] for each in zip(*kinds, strict=True))
         turn = rotation_from_quaternion(self._normal(len(half), 4)).mT
         return points @ turn + middle.unsqueeze(1), normals @ turn
 

@@ -143,7 +143,8 @@ class _Windowed:
 
 def _distinct(centers: Tensor, apart: float) -> Tensor:
     """Return the centers (B, 3) that are not near one kept before them."""
-    near, kept = torch.cdist(centers, centers) < apart, []
+    near = torch.cdist(centers, centers) < apart
+    kept: list[int] = []
     for number in range(len(centers)):
         if not kept or not bool(near[number, kept].any()):
             kept.append(number)
