@@ -39,6 +39,7 @@ class Scene:
 
     Args:
         pose: (num_dofs,) true pose of the shape.
+        shown: (H, W) bool, the pixels that show the shape, not its forearm nor what it holds.
         keypoints: (K, 3) true keypoints, metres; of a hand of other proportions not those of the shape in the pose.
     """
 
@@ -47,6 +48,7 @@ class Scene:
     frame: tr.DepthFrame
     pose: Tensor | None = None
     keypoints: Tensor | None = None
+    shown: Tensor | None = None
 
     def is_right(self, pose: Tensor) -> bool:
         """Return whether a pose is the true one: a hand's fingertips within 15 mm on average, an arm see below."""
@@ -190,15 +192,23 @@ def seen_from(size: float, generator: torch.Generator, target: float) -> tuple[T
 
 
 def photographed(
-    meshes: Sequence[TriangleMesh], generator: torch.Generator, sensor: DepthNoise, window: int = 0
-) -> tr.DepthFrame:
+    meshes: Sequence[TriangleMesh],
+    generator: torch.Generator,
+    sensor: DepthNoise,
+    window: int = 0,
+    sought: TriangleMesh | None = None,
+) -> tuple[tr.DepthFrame, Tensor | None]:
     """Return the picture of meshes in camera coordinates, averaged over windows as by stereo matching.
 
-    What lies behind the camera is left out.
+    What lies behind the camera is left out. With it the pixels (H, W) that show the one that is ``sought``, if any.
     """
-    raster, _ = seen_faces(meshes)
+    raster, number = seen_faces(meshes)
     depth = torch.where(raster.face_index >= 0, raster.depth, 0.0).float()
-    return tr.DepthFrame(sensor.measured(averaged(depth, window), generator), camera())
+    frame = tr.DepthFrame(sensor.measured(averaged(depth, window), generator), camera())
+    if sought is None:
+        return frame, None
+    first = sum(mesh.num_faces for mesh in meshes[: [mesh is sought for mesh in meshes].index(True)])
+    return frame, (number >= first) & (number < first + sought.num_faces) & frame.measured
 
 
 def camera() -> tr.Camera:
@@ -248,16 +258,16 @@ def hand_scene(seed: int, there: bool) -> Scene:
     person, window = varied(seed)
     turn, place = seen_from(size, generator, 0.1 if there else 0.0)
     meshes = [moved(divided(mesh, 0.2), turn, place) for mesh in room(size, generator, 0.4 * size)]
-    pose = random_hand_pose(hand, generator, bend=uniform(generator, 0.1, 0.7))
+    pose, keys, sought = random_hand_pose(hand, generator, bend=uniform(generator, 0.1, 0.7)), None, None
     if there:
         with torch.no_grad():
             keys = hand.keypoints(pose)
             lift = torch.tensor([0.0, 0.0, uniform(generator, 0.08, 0.2)])
             pose[:3] += turn @ lift + place - keys.mean(0)
-            keys, skin = person.keypoints(pose), surface_skin(person)
-            meshes += [posed_mesh(skin, pose), forearm(keys)]
-    picture = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], window)
-    return Scene("hand", hand, picture, pose, keys) if there else Scene("hand", hand, picture)
+            keys, sought = person.keypoints(pose), posed_mesh(surface_skin(person), pose)
+            meshes += [sought, forearm(keys)]
+    picture, shown = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], window, sought)
+    return Scene("hand", hand, picture, pose if there else None, keys, shown)
 
 
 def varied(seed: int) -> tuple[tr.Hand, int]:
@@ -286,11 +296,10 @@ def arm_scene(seed: int, there: bool) -> Scene:
     pose[:3] = place
     pose[3:6] = so3_log((turn @ so3_exp(torch.tensor([[0, 0, uniform(generator, -3, 3)]]))[0])[None])[0]
     pose[6:] = torch.tensor([uniform(generator, -2, 2), uniform(generator, -1, 1), uniform(generator, -2, 2)])
-    if there:
-        skin = arm.file_skin()
-        meshes.append(posed_mesh(skin, pose))
-    frame = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], varied(seed)[1])
-    return Scene("arm", arm, frame, pose if there else None)
+    sought = posed_mesh(arm.file_skin(), pose) if there else None
+    meshes += [] if sought is None else [sought]
+    frame, shown = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], varied(seed)[1], sought)
+    return Scene("arm", arm, frame, pose if there else None, shown=shown)
 
 
 def posed_mesh(skin: LinearBlendSkin, pose: Tensor) -> TriangleMesh:
@@ -305,14 +314,14 @@ def held_scene(seed: int, there: bool) -> Scene:
     turn, place = seen_from(size, generator, 0.1)
     meshes = [moved(divided(mesh, 0.2), turn, place) for mesh in room(size, generator, 0.4 * size)]
     lift = torch.tensor([0.0, 0.0, uniform(generator, 0.05, 0.2)])
-    keys, pose, window = None, None, int(uniform(generator, 0, 4))
+    keys, pose, sought, window = None, None, None, int(uniform(generator, 0, 4))
     if there:
         hand = other_hand(generator, uniform(generator, 0.0, 0.06))
         pose, skin = random_hand_pose(hand, generator, bend=uniform(generator, 0.2, 0.8)), surface_skin(hand)
         with torch.no_grad():
             pose[:3] += turn @ lift + place - hand.keypoints(pose).mean(0)
-            keys = hand.keypoints(pose)
-            meshes += [posed_mesh(skin, pose), forearm(keys)]
+            keys, sought = hand.keypoints(pose), posed_mesh(skin, pose)
+            meshes += [sought, forearm(keys)]
         grip = keys[[0, 5, 17, 6, 10, 14, 4]].mean(0)
         tilt = so3_exp(torch.randn(1, 3, generator=generator))[0]
         meshes.append(moved(held_thing(generator), tilt, grip))
@@ -320,8 +329,8 @@ def held_scene(seed: int, there: bool) -> Scene:
         thing = creature(generator, size * uniform(generator, 0.5, 1.0), held_out=seed < TRAINING_SEEDS)
         tilt = so3_exp(torch.tensor([[uniform(generator, 0, 3), 0.0, uniform(generator, -3, 3)]]))[0]
         meshes.append(moved(thing, tilt, turn @ lift + place))
-    frame = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], window)
-    return Scene("held", tr.Hand(), frame, pose, keys)
+    frame, shown = photographed(meshes, generator, SENSORS[seed % len(SENSORS)], window, sought)
+    return Scene("held", tr.Hand(), frame, pose, keys, shown)
 
 
 def held_thing(generator: torch.Generator) -> TriangleMesh:

@@ -7,11 +7,12 @@ import torch
 
 import torchreg as tr
 from torchreg.datasets import cloud_batches
+from torchreg.datasets.cloud_clutter import Clutter
 
 SIZE = 0.26
 BARE = {
     "noise": (1e-6, 1e-6), "outliers": 0.0, "whole": 0.0, "hole": 0.0, "thinned": 0.0, "stretch": 0.0, "forearm": 0.0,
-    "neighbor": 0.0,
+    "neighbor": 0.0, "scene": 0.0,
 }  # fmt: skip
 
 
@@ -66,3 +67,29 @@ def test_objects_differ_from_the_shape_by_a_share_of_its_size(skin, drawn):
     reach = (there - batch.poses[:, None, :3]).norm(dim=-1)[batch.mask].mean()
     # A stretch along axes at random moves a point by its distance from the base times the deviation.
     assert 0.5 * 0.06 < off / reach < 2 * 0.06
+
+
+def test_windows_of_scenes_hold_things_that_are_no_part_of_the_shape_and_some_do_not_show_it(drawn):
+    there = drawn(scene=1.0, absent=0.0, plane=1.0, window=(0.4, 0.4), window_off=0.0)
+    assert there.is_shown.all()
+    assert ((there.index < 0) & there.mask).any(1).all()
+    spread = there.points - there.points.mean(1, keepdim=True)
+    assert (spread.norm(dim=-1)[there.mask] < 0.8 * SIZE + 1e-4).all()
+    absent = drawn(scene=1.0, absent=1.0)
+    assert not absent.is_shown.any()
+    assert (absent.mask.sum(1) > 50).all()
+
+
+def test_clutter_is_planes_behind_the_middle_and_things_of_some_size():
+    clutter = Clutter(torch.Generator().manual_seed(1), torch.zeros(()), SIZE)
+    middle = torch.tensor([[0.0, 0.0, 0.1], [0.2, 0.0, 0.0]])
+    points, normals = clutter.plane(middle)
+    local = points - points.mean(1, keepdim=True)
+    assert (torch.linalg.svdvals(local)[:, 2] < 1e-4).all()
+    assert (((middle.unsqueeze(1) - points) * normals).sum(-1) > 0.04 * SIZE).all()
+    assert (normals[..., 2] < 0).all()
+    points, normals = clutter.near(middle)
+    center = points.mean(1, keepdim=True)
+    assert ((points - center) * normals).sum(-1).mean() > 0.02 * SIZE
+    assert ((points - center).norm(dim=-1) < 0.8 * SIZE).all()
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(2, normals.shape[1]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -130,10 +129,13 @@ def align(
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = task.skin()
 
-        def aligned(crop: DepthFrame, *, config: AlignConfig) -> AlignResult:
-            return _aligned(replace(task, model_points=skin, config=config, in_picture=True), crop, **options)
+        def aligned(crop: DepthFrame, *, config: AlignConfig, start: Tensor | None = None) -> AlignResult:
+            # What is known holds of what is found, not of a start.
+            start = start if known is None else None
+            asked = replace(task, model_points=skin, config=config, start=start, in_picture=True)
+            return _aligned(asked, crop, **options)
 
-        return align_in_picture(data, skin, aligned, config, partial(source.crop_score, skin))
+        return align_in_picture(data, skin, aligned, config, source.proposer)
     return _aligned(task, data, mask, **options)
 
 

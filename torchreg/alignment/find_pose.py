@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
-from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean, model_size
+from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean
 from torchreg.alignment.inputs import (
     Task,
     check_clouds,
@@ -155,7 +154,7 @@ def find_pose(
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = task.skin()
         task = replace(task, model_points=skin)
-        return surest_crop(data, model_size(skin), found, partial(source.crop_score, skin))[0]
+        return surest_crop(data, skin, lambda crop: found(crop.frame), source.proposer)[0]
     return found(data, mask)
 
 

@@ -183,7 +183,9 @@ class _Run:
         raw = self.net(self.validation.points, self.validation.mask)
         errors = pose_errors(raw, self.validation, self.compared, self.net.shape_size)
         self.net.train()
-        first, best = errors.gather(1, raw.logits.argmax(1, keepdim=True)).mean(), errors.amin(1)
+        shown = self.validation.is_shown
+        first = errors.gather(1, raw.logits.argmax(1, keepdim=True))[shown].mean()
+        best = errors.amin(1)[shown]
         steps = (self.step - 1) % self.config.every + 1
         self.total = torch.zeros_like(total)
         near = (best < _TRAINING.right).double().mean()
@@ -243,7 +245,7 @@ def proposal_loss(
     errors = pose_errors(raw, batch, compared, size)
     likely = torch.logsumexp(raw.logits.log_softmax(-1) - errors / width, dim=-1)
     # In units of the error: the gradient does not grow as the distribution narrows.
-    poses = -width * likely.mean()
+    poses = -width * (likely * batch.is_shown).sum() / batch.is_shown.sum().clamp_min(1)
     index = batch.index.gather(1, raw.token_index)
     known = batch.mask.gather(1, raw.token_index)
     inlier = known & (index >= 0)

@@ -26,6 +26,9 @@ class Segmentation:
     beyond: float = 0.2  # from an end: nothing so near is farther from the other ends
     max_ends: int = 4  # of a surface
     max_surfaces: int = 3  # of a picture
+    gap: float = 0.25  # between surfaces of one shape, a part of which hides what lies between them
+    max_pieces: int = 24  # surfaces that are joined, the largest
+    piece_points: int = 100  # of each, between which gaps are measured
     plane_band: float = 0.02  # within which points lie on one plane
     plane_width: float = 0.7  # from which on no part of the shape is so wide: a floor, a table, a wall
     max_planes: int = 4  # of a picture that are looked for
@@ -109,28 +112,67 @@ class SurfaceGrid:
         return full.to(self.frame.depth.device) & self.frame.measured
 
 
-def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFrame]]:
-    """Yield the crops of a frame that may show a shape of some size, metres, surface by surface, nearer ones first.
+def candidate_crops(frame: DepthFrame, size: float) -> Iterator[DepthFrame]:
+    """Yield the crops of a frame that may show a shape of some size, metres: nearer ones first, joined ones before all.
 
-    A surface of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach
-    of an end, along the surface. Planes that are larger than the shape show something else.
+    Surfaces next to each other that are no larger together are one crop: a shape hides parts of itself. Then a surface
+    of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach of an
+    end, along the surface. Planes that are larger than the shape show something else.
     """
     grid = SurfaceGrid.of(frame, size).without_planes(size)
     if not len(grid.points):
         return
     component = grid.graph.components().to(grid.points.device)
-    depth = frame.camera.project(grid.points)[1]
-    counts = torch.bincount(component)
-    nearness = torch.zeros_like(depth[: len(counts)]).scatter_reduce(0, component, depth, "mean", include_self=False)
+    group = _joined(grid.points, component, size)
+    is_joined = group != component
+    is_joined |= torch.isin(component, group[is_joined])
+    for number, index in _nearest_first(grid, group, size):
+        if bool(is_joined[index].any()):
+            yield frame.cropped(grid.mask(group == number))
+    for _, index in _nearest_first(grid, component, size):
+        for kept in _parts(grid, index, size):
+            yield frame.cropped(grid.mask(kept))
+
+
+def _nearest_first(grid: SurfaceGrid, number: Tensor, size: float) -> Iterator[tuple[int, Tensor]]:
+    """Yield the numbers (V,) of a few surfaces that are large enough, and their nodes (K,), by their mean depth."""
+    depth = grid.frame.camera.project(grid.points)[1]
+    nearness = torch.full_like(depth, torch.inf).scatter_reduce(0, number, depth, "mean", include_self=False)
     num_surfaces = 0
-    for number in nearness.argsort().tolist():
-        index = (component == number).nonzero()[:, 0]
-        if float(_extent(grid.points[index])) < SEGMENTATION.least * size:
-            continue
-        yield (frame.cropped(grid.mask(kept)) for kept in _parts(grid, index, size))
-        num_surfaces += 1
+    for chosen in nearness.argsort()[: len(number.unique())].tolist():
+        index = (number == chosen).nonzero()[:, 0]
+        if float(_extent(grid.points[index])) >= SEGMENTATION.least * size:
+            yield chosen, index
+            num_surfaces += 1
         if num_surfaces == SEGMENTATION.max_surfaces:
             return
+
+
+def _joined(points: Tensor, component: Tensor, size: float) -> Tensor:
+    """Return the numbers (V,) of surfaces, those joined that are near each other and together no larger than a shape.
+
+    The nearest are joined first, as in single-linkage clustering.
+    """
+    found, counts = component.clone(), torch.bincount(component)
+    pieces = counts.argsort(descending=True)[: SEGMENTATION.max_pieces].tolist()
+    samples = []
+    for piece in pieces:
+        index = (component == piece).nonzero()[:, 0]
+        samples.append(points[index[:: -(-len(index) // SEGMENTATION.piece_points)]])
+    gaps = [
+        (float(torch.cdist(samples[one], samples[two]).min()), pieces[one], pieces[two])
+        for one in range(len(pieces))
+        for two in range(one)
+    ]
+    largest = (SEGMENTATION.reach + SEGMENTATION.least) * size
+    for gap, one, two in sorted(gaps):
+        if gap > SEGMENTATION.gap * size:
+            break
+        first, second = (int(found[component == piece][0]) for piece in (one, two))
+        both = (found == first) | (found == second)
+        if first != second and float(_extent(points[both])) <= largest:
+            found[both] = first
+    return found
 
 
 def _largest_patch(on_plane: Tensor, edges: Tensor) -> Tensor:

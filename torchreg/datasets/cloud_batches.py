@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count
+from torchreg.datasets.cloud_clutter import Clutter
 from torchreg.datasets.hand import curled_joints, joint_ranges, placed
 from torchreg.errors import InputError
 from torchreg.geometry.rotation_representations import rotation_from_quaternion, rotation_vector_from_quaternion
@@ -38,6 +39,13 @@ class _Variety:
     neighbor_distance: tuple[float, float] = (0.3, 1.0)  # of the two
     extra_points: tuple[float, float] = (0.1, 1.0)  # of a forearm or a second object for each of the first
     extra_samples: int = 600  # of which those are drawn
+    scene: float = 0.5  # of the clouds, windows of a scene
+    plane: float = 0.6  # of the scenes, with a table or a wall
+    thing: float = 0.6  # of the scenes, with a thing that stands near; as many with one that is held
+    absent: float = 0.2  # of the scenes, without the shape
+    window: tuple[float, float] = (0.45, 0.75)  # radius of a window
+    window_off: float = 0.15  # standard deviation of its middle along each axis
+    least_window: int = 32  # points: a window with fewer shows all
     hole: float = 0.4  # of the clouds, with a ball without points
     hole_radius: tuple[float, float] = (0.05, 0.25)
     thinned: float = 0.5  # of the clouds, of which some points lack
@@ -55,12 +63,20 @@ _VARIETY = _Variety()
 
 @dataclass(frozen=True, eq=False)
 class CloudBatch:
-    """Clouds (B, M, 3) about the origin with a mask (B, M), and the truth: the point of the skin, -1 for outliers."""
+    """Clouds (B, M, 3) about the origin with a mask (B, M), and the truth: the point of the skin, -1 for outliers.
+
+    Clouds without the shape are outliers alone.
+    """
 
     points: Tensor
     mask: Tensor
     poses: Tensor
     index: Tensor
+
+    @property
+    def is_shown(self) -> Tensor:
+        """Which clouds (B,) show the shape."""
+        return (self.mask & (self.index >= 0)).any(-1)
 
 
 def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator) -> Tensor:
@@ -99,7 +115,8 @@ def random_clouds(
 ) -> CloudBatch:
     """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, of a size in metres.
 
-    Proportions differ a little from the shape's; some hands have a forearm, and some clouds a second object.
+    Proportions differ a little from the shape's; some hands have a forearm, and some clouds a second object. Half are
+    windows of scenes: with tables, with things near the shape or held by it, or without the shape.
     """
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)
@@ -109,6 +126,7 @@ def random_clouds(
     visible, slant = draw.visible(scene.points, scene.normals)
     whole = draw.uniform(len(poses), 1) < _VARIETY.whole
     weight = scene.weight * torch.where(whole, 1.0, torch.where(visible, slant, 0.0))
+    weight = torch.where(draw.inside(scene, weight, surface.mean(1)), weight, 0.0)
     # Without replacement, by the largest of the logarithms and Gumbel noise.
     ranks = weight.log() - draw.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
     score, index = ranks.topk(min(num_points, ranks.shape[1]), dim=1)
@@ -120,11 +138,15 @@ def random_clouds(
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Oriented points (B, N, 3) of which clouds are drawn, the first of them the skin's, and how often, (B, N)."""
+    """Oriented points (B, N, 3) of which clouds are drawn, the first of them the skin's, and how often, (B, N).
+
+    `is_window` (B, 1) are the windows of scenes.
+    """
 
     points: Tensor
     normals: Tensor
     weight: Tensor
+    is_window: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,15 +173,32 @@ class _Draw:
         # Normals turn by as little as the proportions differ.
         stretch = axes @ (scale * axes.mT)
         surface = (surface - base.unsqueeze(1)) @ stretch + base.unsqueeze(1)
-        parts = [(surface, normals, torch.ones_like(surface[..., 0]))]
-        for share, (points, facing) in (
-            (forearm, self.forearm(base, surface.mean(1))),
-            (_VARIETY.neighbor, self.neighbor(surface, normals)),
+        is_window = self.uniform(batch, 1) < _VARIETY.scene
+        absent = is_window & (self.uniform(batch, 1) < _VARIETY.absent)
+        shown = torch.where(absent, 0.0, 1.0).expand(-1, count)
+        parts, middle = [(surface, normals, shown)], surface.mean(1)
+        clutter = Clutter(self.generator, self.like, self.size)
+        for share, (points, facing), is_part in (
+            (forearm, self.forearm(base, middle), ~absent),
+            (_VARIETY.neighbor, self.neighbor(surface, normals), ~is_window),
+            (_VARIETY.plane, clutter.plane(middle), is_window),
+            (_VARIETY.thing, clutter.near(middle), is_window),
+            # Something is left where the shape is not.
+            (_VARIETY.thing, clutter.held(surface, normals), is_window),
         ):
-            there = self.uniform(batch, 1) < share
+            there = ((self.uniform(batch, 1) < share) | (absent & is_part)) & is_part
             often = self.between(_VARIETY.extra_points, batch, 1) * count / points.shape[1]
             parts.append((points, facing, torch.where(there, often, 0.0).expand(-1, points.shape[1])))
-        return _Scene(*(torch.cat(part, dim=1) for part in zip(*parts, strict=True)))
+        oriented, facing, often = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
+        return _Scene(oriented, facing, often, is_window)
+
+    def inside(self, scene: _Scene, weight: Tensor, middle: Tensor) -> Tensor:
+        """Return which points (B, N) of scenes are in windows about middles (B, 3), all where the window is empty."""
+        center = middle + _VARIETY.window_off * self.size * _normal(tuple(middle.shape), self.generator, self.like)
+        radius = self.size * self.between(_VARIETY.window, len(middle), 1)
+        inside = (scene.points - center.unsqueeze(1)).norm(dim=-1) < radius
+        enough = (inside & (weight > 0)).sum(1, keepdim=True) >= _VARIETY.least_window
+        return inside | ~(scene.is_window & enough)
 
     def forearm(self, base: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
         """Return oriented points (B, P, 3) of cones that begin at the base and lead away from the middle."""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
+
+import torch
+from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL
 from torchreg.alignment.evidence.reliability import CALIBRATION, shown_probability
-from torchreg.alignment.fit.problem import model_size
 from torchreg.alignment.results import AlignResult, PoseStarts
+from torchreg.alignment.search.crops import LikelyCrop, likely_crops
+from torchreg.alignment.search.pose_proposer import PoseProposer
 from torchreg.capture.depth_frame import DepthFrame
-from torchreg.capture.depth_segments import candidate_crops
 from torchreg.result import Status
 from torchreg.shapes.skin import LinearBlendSkin
 
@@ -22,7 +25,8 @@ class Choice:
     """How the crops of a picture are tried."""
 
     shown: float = PICTURE_MODEL.told  # probability that a crop shows the shape from which on no other crop is tried
-    enough: float = CALIBRATION.doubtful  # confidence from which on no surface farther away is, nor other poses near
+    missed: float = 0.05  # the same of all crops that are left, below which none of them is tried: the level of a test
+    enough: float = CALIBRATION.doubtful  # confidence from which on other poses near are not sought
     not_found: float = 0.05  # below which the best pose is rejected, at the usual level of a test
 
 
@@ -31,51 +35,57 @@ Answer = TypeVar("Answer", AlignResult, PoseStarts)
 
 
 class Aligner(Protocol):
-    """What aligns a shape to a crop with given settings."""
+    """What aligns a shape to a crop with given settings, from a start or without."""
 
-    def __call__(self, crop: DepthFrame, *, config: AlignConfig) -> AlignResult: ...  # noqa: D102
+    def __call__(  # noqa: D102
+        self, crop: DepthFrame, *, config: AlignConfig, start: Tensor | None = None
+    ) -> AlignResult: ...
 
 
 def align_in_picture(
-    frame: DepthFrame,
-    skin: LinearBlendSkin,
-    aligned: Aligner,
-    config: AlignConfig,
-    crop_score: Callable[[DepthFrame], float],
+    frame: DepthFrame, skin: LinearBlendSkin, aligned: Aligner, config: AlignConfig, proposer: PoseProposer | None
 ) -> AlignResult:
     """Return the most probable alignment to crops of a frame, and its crop.
 
-    All crops are aligned without a search around the result; then the most probable one with it, if it is in doubt.
-    NOT_FOUND where even the most probable pose is hardly right.
+    Crops are aligned from a network's pose, or without a search around the result; then the most probable one with a
+    search that knows rivals, unless it had one that leaves no doubt. NOT_FOUND where even its pose is hardly right.
     """
     quick = replace(config, search="never")
-    found, crop = surest_crop(frame, model_size(skin), lambda crop: aligned(crop, config=quick), crop_score)
-    if _confidence(found) < CHOICE.enough and config.search != "never" and found.coefficients is None:
-        found = aligned(crop, config=config)
-    return replace(_not_found_if_improbable(found), crop=crop.mask)
+
+    def answer(crop: LikelyCrop) -> AlignResult:
+        return aligned(crop.frame, config=quick, start=crop.start)
+
+    found, crop = surest_crop(frame, skin, answer, proposer)
+    is_sure = _confidence(found) >= CHOICE.enough or config.search == "never" or found.coefficients is not None
+    if crop.start is not None or not is_sure:
+        found = aligned(crop.frame, config=config)
+    return replace(_not_found_if_improbable(found), crop=crop.frame.mask)
 
 
 def surest_crop(
-    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], crop_score: Callable[[DepthFrame], float]
-) -> tuple[Answer, DepthFrame]:
-    """Return the answer of highest confidence for the crops of a frame, and that crop; near ones are tried first."""
-    best: tuple[Answer, DepthFrame] | None = None
-    for crops in candidate_crops(frame, size):
-        for crop, is_likely in _likely_first(crops, crop_score):
-            # What needs a search is tried where no other crop is believed.
-            if best is not None and not is_likely and _confidence(best[0]) >= CHOICE.enough:
-                break
-            found = answer(crop)
-            if best is None or _confidence(found) > _confidence(best[0]):
-                best = found, crop
-            if _shown(found) >= CHOICE.shown:
-                return best
-        # Farther surfaces are tried where no end of a nearer one may be the shape.
-        if best is not None and _confidence(best[0]) >= CHOICE.enough:
-            return best
+    frame: DepthFrame,
+    skin: LinearBlendSkin,
+    answer: Callable[[LikelyCrop], Answer],
+    proposer: PoseProposer | None,
+) -> tuple[Answer, LikelyCrop]:
+    """Return the answer to the crop of a frame that most probably shows a shape, and that crop.
+
+    At most one crop shows the shape: others are tried while they may do so, by the odds of all of them.
+    """
+    best: tuple[Answer, LikelyCrop] | None = None
+    crops = likely_crops(frame, skin, proposer)
+    total = 1 + sum(crop.odds for crop in crops)
+    left = total - 1
+    for crop in crops:
+        found = answer(crop)
+        if best is None or _worth(found, crop) > _worth(*best):
+            best = found, crop
+        left -= crop.odds
+        if _shown(found) >= CHOICE.shown or left < CHOICE.missed * total:
+            break
     if best is not None:
         return best
-    everything = frame.cropped(frame.measured)
+    everything = LikelyCrop(frame.cropped(frame.measured))
     return answer(everything), everything
 
 
@@ -89,12 +99,12 @@ def _not_found_if_improbable(found: AlignResult) -> AlignResult:
     return replace(found, status=Status.NOT_FOUND, doubt="; ".join(doubts))
 
 
-def _likely_first(
-    crops: Iterable[DepthFrame], crop_score: Callable[[DepthFrame], float]
-) -> list[tuple[DepthFrame, bool]]:
-    """Return crops, the likeliest first, and whether they are likely to show anything without a search."""
-    seen = sorted(((crop_score(crop), crop) for crop in crops), key=lambda pair: -pair[0])
-    return [(crop, likely >= CHOICE.enough) for likely, crop in seen]
+def _worth(found: Any, crop: LikelyCrop) -> float:
+    """Return by what crops are compared: the odds of the better pose in a network's window, or the confidence."""
+    if crop.start is None or not isinstance(found, AlignResult):
+        return _confidence(found)
+    shown = min(_shown(found), 1 - torch.finfo(torch.float32).eps)
+    return max(crop.odds, shown / (1 - shown))
 
 
 def _confidence(found: Any) -> float:

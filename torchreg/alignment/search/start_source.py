@@ -8,20 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg._threads import one_thread
-from torchreg.alignment.evidence.confidence import explains
-from torchreg.alignment.evidence.reliability import without_cut
-from torchreg.alignment.fit.problem import AlignProblem, centered_problem
+from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.search.fit_proposals import best_proposal, best_proposals, with_proposed_prior
+from torchreg.alignment.search.fit_proposals import best_proposals, with_proposed_prior
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shared_proposer
 from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, PoseSource, UprightRotations
-from torchreg.capture.depth_frame import DepthFrame
-from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin
 
 
 @dataclass(frozen=True)
@@ -65,23 +59,6 @@ class StartSource:
         proposals = self.proposer.propose(problem.data, problem.valid)
         problem = with_proposed_prior(problem, proposals)
         return problem, self._substituted(problem, best_proposals(problem, proposals, count))
-
-    @torch.no_grad()
-    def crop_score(self, skin: LinearBlendSkin, frame: DepthFrame) -> float:
-        """Return the confidence in the network's pose of the shape in a frame; 1 without a network."""
-        if self.proposer is None:
-            return 1.0
-        near = frame.near(frame.points.double().mean(0))
-        data = near.points[None].to(skin.shape.rest)
-        valid, origin = torch.ones_like(data[..., 0], dtype=torch.bool), torch.zeros_like(data[:, 0])
-        problem = centered_problem(
-            skin, data, valid, skin.shape.rest[None], origin, prior_std=None, pose_atol=0.0,
-            free_space=FreeSpace.stacked([near.free_space]),
-        )  # fmt: skip
-        with one_thread():
-            best = best_proposal(problem, self.proposer.propose(data, valid))
-            uncropped = without_cut(problem, best.pose, [near])
-            return float(explains(uncropped, best.pose, best.lead))
 
     def _substituted(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(

@@ -1,0 +1,151 @@
+"""Which parts of a whole picture may show a shape: windows in which a network proposes poses, or pieces of surfaces."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._threads import one_thread
+from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, picture_views
+from torchreg.alignment.fit.problem import AlignProblem, centered_problem, model_size
+from torchreg.alignment.search.fit_proposals import best_proposal
+from torchreg.alignment.search.pose_proposer import PoseProposer, Proposals
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.depth_segments import SurfaceGrid, candidate_crops
+from torchreg.capture.free_space import FreeSpace
+from torchreg.geometry.sampling import farthest_points
+from torchreg.shapes.pose_algebra import shifted
+from torchreg.shapes.skin import LinearBlendSkin
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Numbers of the windows of a picture; lengths are shares of the shape's size."""
+
+    radius: float = 0.55  # of a window: half the shape, and as much as a network may be off
+    apart: float = 0.2  # windows nearer to one another show the same
+    most: int = 48  # that a network looks into
+    fitted: int = 12  # of those, the likeliest, to which its poses are fitted
+    least: int = 30  # points of a window
+    pose_error: float = 0.03  # standard deviation of data about a fitted proposal
+
+
+_WINDOWS = _Windows()
+
+
+@dataclass(frozen=True, eq=False)
+class LikelyCrop:
+    """A crop of a picture, the odds that it shows the shape, as a Bayes factor, and a network's pose (num_dofs,) in it.
+
+    Without a network all odds are even.
+    """
+
+    frame: DepthFrame
+    odds: float = 1.0
+    start: Tensor | None = None
+
+
+def likely_crops(frame: DepthFrame, skin: LinearBlendSkin, proposer: PoseProposer | None) -> list[LikelyCrop]:
+    """Return the crops of a frame that may show a shape, likeliest first.
+
+    With a network: what belongs to the shape of windows in which its fitted poses agree best with the picture. Without:
+    pieces of surfaces, nearest first, all with even odds.
+    """
+    size = model_size(skin)
+    if proposer is None:
+        return [LikelyCrop(crop) for crop in candidate_crops(frame, size)]
+    grid = SurfaceGrid.of(frame, size).without_planes(size)
+    with torch.no_grad(), one_thread():
+        return _proposed_crops(grid, skin, proposer) if len(grid.points) >= _WINDOWS.least else []
+
+
+def _proposed_crops(grid: SurfaceGrid, skin: LinearBlendSkin, proposer: PoseProposer) -> list[LikelyCrop]:
+    """Return crops of the windows of a grid, likeliest first."""
+    points, size = grid.points.to(skin.shape.rest), model_size(skin)
+    centers = points[farthest_points(points, min(_WINDOWS.most, len(points)))]
+    windows = _Windowed.about(points, _distinct(centers, _WINDOWS.radius / 2 * size), size)
+    # The network's poses are better where it sees the shape in the middle.
+    likely = windows.proposed(proposer)
+    middle = skin.shape.keypoints(likely.poses[:, 0]).mean(1) + windows.centers
+    order = likely.inlier.sum(-1).argsort(descending=True)
+    windows = _Windowed.about(points, _distinct(middle[order], _WINDOWS.apart * size)[: _WINDOWS.fitted], size)
+    if not len(windows.centers):
+        return []
+    proposals = windows.proposed(proposer)
+    frames = [grid.frame.near(center.double()) for center in windows.centers]
+    problem = windows.problem(skin, frames)
+    poses = best_proposal(problem, proposals).pose
+    views = torch.stack([whole.table() for whole, _ in picture_views(problem, poses, frames)])
+    odds = PICTURE_MODEL.log_odds(views).exp()
+    starts = shifted(poses, windows.centers)
+    return [
+        LikelyCrop(grid.frame.cropped(mask), float(odds[row]), starts[row])
+        for row in odds.argsort(descending=True).tolist()
+        if int((mask := grid.mask(windows.belonging(row, problem, poses, proposals))).sum()) >= _WINDOWS.least
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Windowed:
+    """Points (V, 3) of a grid, metres, and those in balls about centers (B, 3): their numbers and a mask (B, M)."""
+
+    everything: Tensor
+    centers: Tensor
+    index: Tensor
+    valid: Tensor
+
+    @classmethod
+    def about(cls, points: Tensor, centers: Tensor, size: float) -> _Windowed:
+        """Return the windows about centers that hold enough points."""
+        inside = torch.cdist(centers, points) < _WINDOWS.radius * size
+        enough = inside.sum(1) >= _WINDOWS.least
+        centers, inside = centers[enough], inside[enough]
+        count = int(inside.sum(1).max()) if len(inside) else 0
+        valid, index = inside.float().topk(count, dim=1)
+        return cls(points, centers, index, valid > 0)
+
+    @property
+    def points(self) -> Tensor:
+        """The points (B, M, 3) about the centers, metres."""
+        return torch.where(self.valid.unsqueeze(-1), self.everything[self.index] - self.centers.unsqueeze(1), 0.0)
+
+    def proposed(self, proposer: PoseProposer) -> Proposals:
+        """Return the poses of a network about the centers."""
+        return proposer.propose(self.points, self.valid)
+
+    def problem(self, skin: LinearBlendSkin, frames: list[DepthFrame]) -> AlignProblem:
+        """Return the problems of fitting a shape to the windows, each about its center."""
+        count = len(self.centers)
+        return centered_problem(
+            skin, self.points, self.valid, skin.shape.rest.expand(count, -1), torch.zeros_like(self.centers),
+            prior_std=None, pose_atol=0.0, free_space=FreeSpace.stacked([each.free_space for each in frames]),
+        )  # fmt: skip
+
+    def belonging(self, row: int, problem: AlignProblem, poses: Tensor, proposals: Proposals) -> Tensor:
+        """Return the points (V,) that belong to the shape in a window rather than to something else.
+
+        By the network, and by the distance from its fitted pose: normal for the shape, uniform for something else.
+        """
+        valid = self.valid[row]
+        points = self.points[row, valid]
+        nearest = torch.cdist(points, proposals.points[row]).argmin(-1)
+        told = proposals.inlier[row, nearest].clamp(0.02, 0.98).logit()
+        distance = problem.surface.distance(points[None], poses[row, None])[0] / problem.size
+        on_shape = -0.5 * (distance / _WINDOWS.pose_error).square()
+        level = math.log(2 / math.sqrt(2 * math.pi) / _WINDOWS.pose_error * _WINDOWS.radius)
+        kept = torch.zeros(len(self.everything), dtype=torch.bool, device=points.device)
+        kept[self.index[row, valid]] = told + on_shape + level > 0
+        return kept
+
+
+def _distinct(centers: Tensor, apart: float) -> Tensor:
+    """Return the centers (B, 3) that are not near one kept before them."""
+    near = torch.cdist(centers, centers) < apart
+    kept: list[int] = []
+    for number in range(len(centers)):
+        if not kept or not bool(near[number, kept].any()):
+            kept.append(number)
+    return centers[kept]
