@@ -77,6 +77,19 @@ def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Nois
     return Relative(seen, torch.linalg.inv(covariance), max(2.0, count), center, unit)
 
 
+def from_ground(motions: Tensor, blocks: Blocks, link: int | Tensor, noise: Noise, size: float) -> Relative:
+    """Return the motions of a link seen from the ground, which stands still without an error."""
+    still = torch.eye(4, dtype=torch.float64).expand(len(motions), 4, 4)
+    sure = torch.eye(6, dtype=torch.float64).expand(len(motions), 6, 6) / torch.finfo(torch.float64).eps
+    both = Blocks(
+        hessian=torch.stack([sure, blocks.hessian[:, link]], 1),
+        gradient=blocks.gradient[:, [link, link]],
+        centers=blocks.centers[:, [link, link]],
+        count=torch.stack([torch.zeros_like(blocks.count[:, link]), blocks.count[:, link]], 1),
+    )
+    return relative(torch.stack([still, motions[:, link]], 1), both, (0, 1), noise, size)
+
+
 def best_joint(data: Relative) -> Candidate:
     """Return the joint of least description length: squared errors in standard deviations, and parameters.
 

@@ -23,7 +23,7 @@ from torchreg.io.urdf_file.write import save_urdf
 from torchreg.registration.robots.fit import HasBlocks, Mechanism, axis_stds, fitted, settled
 from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.growth import GROWTH, Growth, grown
-from torchreg.registration.robots.joints import Candidate, best_joint, relative
+from torchreg.registration.robots.joints import Candidate, best_joint, from_ground, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
 from torchreg.shapes.posed_tree import PosedTree
@@ -126,7 +126,7 @@ def find_robot(
     for _ in range(MODEL.rounds):
         motions, label, noise = find_links(surfaces, motions, label)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
-        mechanism, label = assembled(surfaces, motions, label, joints)
+        mechanism, label = assembled(surfaces, motions, label, joints, noise)
         mechanism = settled(surfaces, mechanism, label, noise)
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
@@ -166,8 +166,7 @@ def compared_with_each_other(
     motions = torch.eye(4, dtype=torch.float64).repeat(len(scans), len(mechanism.parents), 1, 1)
     for _ in range(MODEL.fusions):
         motions[frames] = mechanism.motions()
-        moved = surfaces.moved(motions[:, label])[0]
-        fused = FusedScans.of(scans, moved, label, motions, surfaces.size, reference)
+        fused = FusedScans.of(scans, surfaces, label, motions, reference)
         sigma = fused.noise(motions[frames]).sigma
         mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
     return fused, mechanism
@@ -198,9 +197,13 @@ def without_welds(
 
 
 def assembled(
-    surfaces: Surfaces, motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate]
+    surfaces: Surfaces, motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate], noise: Noise
 ) -> tuple[Mechanism, Tensor]:
-    """Return the tree of the joints of most evidence, and the labels by its links."""
+    """Return the tree of the joints of most evidence, and the labels by its links.
+
+    The ground is a link too: where the data speak for it, the root stands still, or hangs on a base that does. A round
+    base shows by that alone that what stands on it turns.
+    """
     count, frames = motions.shape[1], len(motions)
     pairs = torch.tensor(list(joints), dtype=torch.long).reshape(-1, 2)
     lengths = torch.tensor([joint.length for joint in joints.values()], dtype=torch.float64)
@@ -208,18 +211,28 @@ def assembled(
     parents, order = rooted(chosen, surfaces.travel(motions, label).argmin().reshape(1), count)
     place = torch.zeros_like(order)
     above, axes, values = [-1], [torch.zeros(6).double()], [torch.zeros(frames).double()]
+
+    def hang(parent: int, joint: Candidate, sign: int) -> int:
+        # Seen from the other link, joints in a row come in reverse. Between two of them is a link without samples.
+        for twist, value in list(zip(joint.twists, joint.values.mT, strict=True))[::sign]:
+            above.append(parent)
+            axes.append(twist)
+            values.append(sign * value)
+            parent = len(above) - 1
+        return parent
+
+    blocks = surfaces.blocks(motions, label, NUMBERS.cut * noise.sigma)
+    ground = best_joint(from_ground(motions, blocks, order[0], noise, surfaces.size))
+    held = ground.length < 0
+    if held and ground.kind != "fixed":
+        place[order[0]] = hang(0, ground, 1)
     for link in order[1:].tolist():
         parent = int(parents[link])
         joint = joints[min(link, parent), max(link, parent)]
-        # Seen from the other link, joints in a row come in reverse. Between two of them is a link without samples.
-        row = list(zip(joint.twists, joint.values.mT, strict=True))
-        for number, (twist, value) in enumerate(row if parent < link else row[::-1]):
-            above.append(len(above) - 1 if number else int(place[parent]))
-            axes.append(twist)
-            values.append(value if parent < link else -value)
-        place[link] = len(above) - 1
+        place[link] = hang(int(place[parent]), joint, 1 if parent < link else -1)
+    base = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1) if held else motions[:, order[0]]
     mechanism = Mechanism(
-        parents=tuple(above), axes=torch.stack(axes), base=motions[:, order[0]], values=torch.stack(values, 1)
+        parents=tuple(above), axes=torch.stack(axes), base=base, values=torch.stack(values, 1), held=held
     )
     return mechanism, place[label]
 
