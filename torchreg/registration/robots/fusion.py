@@ -58,12 +58,17 @@ class FusedScans:
     ) -> FusedScans:
         """Return the scans of all frames but the reference, whose pose stays, to compare with all.
 
-        A point belongs to the link of the nearest of the samples (n,) under the motions (F, K, 4, 4) of their links; it
-        moves into the reference by the inverse of that motion.
+        A point belongs to the link of the nearest of the samples (n,) under the motions (F, K, 4, 4) of their links,
+        whose normal has the right sign; it moves into the reference by the inverse of that motion.
         """
         piece, owner = surfaces.pieces(label)
-        moved, size = surfaces.moved(motions[:, label])[0], surfaces.size
-        pieces = [piece[NeighborTree(own).nearest(scan.points)[0]] for scan, own in zip(scans, moved, strict=True)]
+        size, nearest, known = surfaces.size, [], []
+        for scan, moved, facing in zip(scans, *surfaces.moved(motions[:, label]), strict=True):
+            sample = NeighborTree(moved).nearest(scan.points)[0]
+            against = (facing[sample] * scan.normals).sum(-1, keepdim=True) < 0
+            known.append(scan.facing(torch.where(against, -scan.normals, scan.normals)))
+            nearest.append(sample)
+        scans, pieces = known, [piece[sample] for sample in nearest]
         links = [owner[own] for own in pieces]
         placed = [_in_reference(*row) for row in zip(scans, links, motions, strict=True)]
         points, normals, link = (

@@ -117,6 +117,8 @@ def find_robot(
     if scans is None:
         turned = (moved[:, part, :3, :3] @ normals.unsqueeze(-1)).squeeze(-1)
         scans = [Target(*frame) for frame in zip(deformed, turned, strict=True)]
+    if sparse:
+        scans = [Target(scan.points, scan.normals, signed=False) for scan in scans]
     frames = torch.tensor([frame for frame in range(len(deformed)) if frame != reference])
     order = even_order(points, min(len(points), MODEL.samples))
     surfaces = Surfaces.of(points[order], normals[order], [scans[frame] for frame in frames.tolist()])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,19 +32,25 @@ NUMBERS = SurfaceNumbers()
 
 
 class Target:
-    """A scan to be compared with."""
+    """A scan to be compared with; where normals are estimates, whole links may have the other sign: it is not used."""
 
-    def __init__(self, points: Tensor, normals: Tensor) -> None:
-        self.points, self.normals = points, normals
+    def __init__(self, points: Tensor, normals: Tensor, *, signed: bool = True) -> None:
+        self.points, self.normals, self.signed = points, normals, signed
         self.spacing = sampling_distance(points)
         self.tree = NeighborTree(points)
+
+    def facing(self, normals: Tensor) -> Target:
+        """Return the scan with other normals, whose signs are known."""
+        found = copy.copy(self)
+        found.normals, found.signed = normals, True
+        return found
 
     def residuals(self, moved: Tensor, normals: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return signed distances (..., K) of moved points from this scan's planes, its normals, and squared distances.
 
         The squared distances (..., K) are across the planes and, beyond the spacing of the scan's points, along them;
-        those of points whose normals (..., K, 3) face the other way, or that no point of the scan is within reach of,
-        are infinite.
+        those of points whose normals (..., K, 3) face the other way, if signs are known, or that no point of the scan
+        is within reach of, are infinite.
         """
         found, distance = self.tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
         index = found.reshape(moved.shape[:-1])
@@ -52,7 +59,9 @@ class Target:
         across = (offset * facing).sum(-1)
         along = (offset.square().sum(-1) - across.square()).clamp_min(0).sqrt()
         square = across.square() + (along - self.spacing).clamp_min(0).square()
-        return across, facing, torch.where(near & ((facing * normals).sum(-1) > 0), square, torch.inf)
+        if self.signed:
+            near &= (facing * normals).sum(-1) > 0
+        return across, facing, torch.where(near, square, torch.inf)
 
 
 @dataclass(frozen=True, eq=False)
