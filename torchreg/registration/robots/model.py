@@ -36,6 +36,7 @@ class ModelNumbers:
     samples: int = 2500  # of the reference
     rounds: int = 2  # of links, joints and the fit of all; a third changes nothing on scans of arms
     fusions: int = 6  # of all scans to one surface, and fits to it: the axes of later ones change by tenths of degrees
+    still: float = 0.1  # standard deviations: a mean step of the samples from which a fusion is the last
     kernels: tuple[float, ...] = (5.0, 4.0, 3.0, 3.0)  # of each fit, standard deviations
     thinned: float = 0.5  # of a scan's spacing, between points of a surface that is made of all scans
     unsure: float = 0.087  # standard deviation of an axis that the scans do not determine, radians: five degrees
@@ -144,7 +145,8 @@ def find_robot(
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
     found = _described(mechanism, points, link, frames, residuals, loose)
     axis, origin = axis_stds(fit[0], mechanism, label, fit[1], found.origins())
-    return replace(found, axis_std=axis[1:], origin_std=origin[1:])
+    shown = _shown(surfaces, mechanism, label)[1:]
+    return replace(found, axis_std=axis[1:].where(shown, torch.inf), origin_std=origin[1:].where(shown, torch.inf))
 
 
 def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,6 +173,9 @@ def compared_with_each_other(
         fused = FusedScans.of(scans, surfaces, label, motions, reference)
         sigma = fused.noise(motions[frames]).sigma
         mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
+        moved = [surfaces.moved(own[:, label])[0] for own in (motions[frames], mechanism.motions())]
+        if float((moved[1] - moved[0]).norm(dim=-1).mean()) < MODEL.still * sigma:
+            break
     return fused, mechanism
 
 
@@ -237,6 +242,23 @@ def assembled(
         parents=tuple(above), axes=torch.stack(axes), base=base, values=torch.stack(values, 1), held=held
     )
     return mechanism, place[label]
+
+
+def _shown(surfaces: Surfaces, mechanism: Mechanism, label: Tensor) -> Tensor:
+    """Return for each link whether the scans show it and its parent where the joints put them.
+
+    Standard deviations hold for links that are right; one that most scans do not show there is not.
+    """
+    motions, parents = mechanism.motions(), mechanism.parents
+    costs = Growth(surfaces, motions, label).costs(motions).gather(1, label.unsqueeze(1))[:, 0]
+    count = torch.bincount(label, minlength=len(parents))
+    shares = torch.zeros(len(parents)).double().index_add(0, label, (costs > GROWTH.explained).double()) / count
+    # A link without samples is as right as the next.
+    own = [bool(share <= 0.5) for share in shares]
+    for link in reversed(range(1, len(parents))):
+        if not count[parents[link]]:
+            own[parents[link]] = own[link]
+    return torch.tensor([own[link] and own[max(parent, 0)] for link, parent in enumerate(parents)])
 
 
 def _loose(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> tuple[bool, ...]:
