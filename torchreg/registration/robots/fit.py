@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchreg.geometry.rigid import adjoint, se3_exp
+from torchreg.geometry.rigid import adjoint, invert_rigid, se3_exp
 from torchreg.geometry.rotation import skew
 from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
 
@@ -60,6 +60,25 @@ class Mechanism:
         for link, parent in enumerate(self.parents):
             found.append(self.base if parent < 0 else found[parent] @ turns[:, link])
         return torch.stack(found, 1)
+
+    def with_frame(self, frame: int) -> Mechanism:
+        """Return the mechanism in one more frame, that in whose coordinates it is."""
+        base, values = (
+            torch.cat([rows[:frame], new.unsqueeze(0), rows[frame:]])
+            for rows, new in ((self.base, torch.eye(4).double()), (self.values, torch.zeros_like(self.axes[:, 0])))
+        )
+        return replace(self, base=base, values=values)
+
+    def seen_from(self, frame: int) -> Mechanism:
+        """Return the mechanism in the coordinates of a frame, where its values are zero, and without that frame."""
+        here, kept = self.motions()[frame], torch.arange(len(self.values)) != frame
+        above = here[torch.tensor(self.parents).clamp_min(0)]
+        return replace(
+            self,
+            axes=(adjoint(above) @ self.axes.unsqueeze(-1)).squeeze(-1),
+            base=(self.base @ invert_rigid(self.base[frame]))[kept],
+            values=(self.values - self.values[frame])[kept],
+        )
 
     def stepped(self, base: Tensor, values: Tensor, axes: Tensor) -> Mechanism:
         """Return the mechanism after steps of the base (T, 6), the values (T, K) and the axes, twists (K, 6)."""
@@ -197,7 +216,7 @@ def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float
 
 
 def axis_stds(
-    surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
+    surfaces: HasBlocks, mechanism: Mechanism, noise: Noise, label: Tensor, points: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
     motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)

@@ -53,10 +53,8 @@ class FusedScans:
     size: float
 
     @classmethod
-    def of(
-        cls, scans: Sequence[Target], surfaces: Surfaces, label: Tensor, motions: Tensor, reference: int
-    ) -> FusedScans:
-        """Return the scans of all frames but the reference, whose pose stays, to compare with all.
+    def of(cls, scans: Sequence[Target], surfaces: Surfaces, label: Tensor, motions: Tensor) -> FusedScans:
+        """Return the scans of all frames, each to compare with the others.
 
         A point belongs to the link of the nearest of the samples (n,) under the motions (F, K, 4, 4) of their links,
         whose normal has the right sign; it moves into the reference by the inverse of that motion.
@@ -84,11 +82,10 @@ class FusedScans:
         normals = torch.where((fitted * normals).sum(-1, keepdim=True) < 0, -fitted, fitted)
         place = _place(points, normals, link, spacing, size)
         member = torch.nn.functional.one_hot(link, motions.shape[1]).to(points)
-        kept = [number for number in range(len(scans)) if number != reference]
-        others = [frame != number for number in kept]
+        others = [frame != number for number in range(len(scans))]
         return cls(
-            scans=[scans[number] for number in kept],
-            pieces=[pieces[number] for number in kept],
+            scans=scans,
+            pieces=pieces,
             owner=owner,
             trees=[NeighborTree(place[other]) for other in others],
             points=[points[other] for other in others],

@@ -134,17 +134,17 @@ def find_robot(
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
-    fit: tuple[HasBlocks, Noise] = surfaces, noise
+    fit: tuple[HasBlocks, Mechanism, Noise] = surfaces, mechanism, noise
     if sparse:
-        fused, mechanism = compared_with_each_other(scans, surfaces, mechanism, label, frames)
+        fused, whole = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label)
+        mechanism, fit = whole.seen_from(reference), (fused, whole, fused.noise(whole.motions()))
         motions = mechanism.motions()
-        fit = fused, fused.noise(motions)
     loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
     found = _described(mechanism, points, link, frames, residuals, loose)
-    axis, origin = axis_stds(fit[0], mechanism, label, fit[1], found.origins())
+    axis, origin = axis_stds(*fit, label, found.origins())
     shown = _shown(surfaces, mechanism, label)[1:]
     return replace(found, axis_std=axis[1:].where(shown, torch.inf), origin_std=origin[1:].where(shown, torch.inf))
 
@@ -160,21 +160,19 @@ def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tupl
 
 
 def compared_with_each_other(
-    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor, frames: Tensor
+    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor
 ) -> tuple[FusedScans, Mechanism]:
     """Return all scans on the links (n,) of samples, and the mechanism fitted to what each scan shows with the others.
 
-    ``frames``: numbers of the mechanism's frames among the T scans; the one left out is the reference.
+    The reference is a frame as any other: an error of its own would turn the axes by as much as joints turn little.
     """
-    (reference,) = set(range(len(scans))) - set(frames.tolist())
-    motions = torch.eye(4, dtype=torch.float64).repeat(len(scans), len(mechanism.parents), 1, 1)
     for _ in range(MODEL.fusions):
-        motions[frames] = mechanism.motions()
-        fused = FusedScans.of(scans, surfaces, label, motions, reference)
-        sigma = fused.noise(motions[frames]).sigma
+        motions = mechanism.motions()
+        fused = FusedScans.of(scans, surfaces, label, motions)
+        sigma = fused.noise(motions).sigma
         mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
-        moved = [surfaces.moved(own[:, label])[0] for own in (motions[frames], mechanism.motions())]
-        if float((moved[1] - moved[0]).norm(dim=-1).mean()) < MODEL.still * sigma:
+        before, after = (surfaces.moved(own[:, label])[0] for own in (motions, mechanism.motions()))
+        if float((after - before).norm(dim=-1).mean()) < MODEL.still * sigma:
             break
     return fused, mechanism
 
