@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchreg.geometry.rigid import adjoint, invert_rigid, se3_exp
+from torchreg.geometry.rigid import adjoint, se3_exp
 from torchreg.geometry.rotation import skew
 from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
 
@@ -32,6 +32,11 @@ class HasBlocks(Protocol):
     @property
     def size(self) -> float:
         """Diagonal of the samples."""
+        ...
+
+    @property
+    def reference(self) -> int | None:
+        """Number of the frame that stays, where the parts are made of all scans and move with these; or none."""
         ...
 
     def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
@@ -69,16 +74,10 @@ class Mechanism:
         )
         return replace(self, base=base, values=values)
 
-    def seen_from(self, frame: int) -> Mechanism:
-        """Return the mechanism in the coordinates of a frame, where its values are zero, and without that frame."""
-        here, kept = self.motions()[frame], torch.arange(len(self.values)) != frame
-        above = here[torch.tensor(self.parents).clamp_min(0)]
-        return replace(
-            self,
-            axes=(adjoint(above) @ self.axes.unsqueeze(-1)).squeeze(-1),
-            base=(self.base @ invert_rigid(self.base[frame]))[kept],
-            values=(self.values - self.values[frame])[kept],
-        )
+    def without_frame(self, frame: int) -> Mechanism:
+        """Return the mechanism in one frame less."""
+        kept = torch.arange(len(self.values)) != frame
+        return replace(self, base=self.base[kept], values=self.values[kept])
 
     def stepped(self, base: Tensor, values: Tensor, axes: Tensor) -> Mechanism:
         """Return the mechanism after steps of the base (T, 6), the values (T, K) and the axes, twists (K, 6)."""
@@ -150,27 +149,35 @@ class _System:
     """The system of all parts, and what it is made of."""
 
     own: Tensor  # (T, K, 6, D) the parts' twists by steps of their frames
-    shared: Tensor  # (T, K, 6, 6 K) by steps of the axes
+    shared: Tensor  # (T, K, 6, 6 K) by steps of the axes, (T, K, 6, 12 K) with those of the parts, made of all scans
     sums: _Sums
     hold: Tensor
 
     @classmethod
-    def of(cls, blocks: Blocks, mechanism: Mechanism, unit: float) -> _System:
-        """Return the system of the normal equations of all parts; ``unit`` is the size of the thing."""
-        frames, size = mechanism.values.shape
-        by_value, by_axis = mechanism.jacobians(mechanism.motions())
+    def of(cls, data: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
+        """Return the system of the normal equations of all parts at a robust scale."""
+        motions, (frames, size) = mechanism.motions(), mechanism.values.shape
+        blocks = data.blocks(motions, label, scale)
+        by_value, by_axis = mechanism.jacobians(motions)
         # Twists about the origin move a part's center c by v + w x c.
         change = torch.eye(6).double().repeat(frames, size, 1, 1)
         change[..., :3, 3:] = -skew(blocks.centers)
         by_base = torch.eye(6).double() * (not mechanism.held)
         own = change @ torch.cat([by_base.expand(frames, size, 6, 6), by_value], -1)
         shared = change @ by_axis.flatten(-2)
-        metric = torch.tensor([1.0] * 3 + [(0.5 * unit) ** 2] * 3, dtype=torch.float64)
+        if data.reference is not None:
+            # Parts stay where the other scans put them only until these move: without that, steps are far too short.
+            own[data.reference] = 0
+            parts = torch.zeros(frames, size, 6, size, 6, dtype=torch.float64)
+            parts[:, range(size), :, range(size)] = (change @ adjoint(motions)).transpose(0, 1)
+            shared = torch.cat([shared, parts.flatten(-2)], -1)
+        metric = torch.tensor([1.0] * 3 + [(0.5 * data.size) ** 2] * 3, dtype=torch.float64)
         weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
         hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
         sums = _Sums.of(own, shared, hessian, blocks.gradient)
         local = sums.local + 1e-9 * torch.diag_embed(sums.local.diagonal(dim1=-2, dim2=-1) + weight.mean())
-        return cls(own, shared, sums._replace(local=local), FIT.damping * weight.mean() * metric.repeat(size) + 1e-9)
+        hold = FIT.damping * weight.mean() * metric.repeat(shared.shape[-1] // 6) + 1e-9
+        return cls(own, shared, sums._replace(local=local), hold)
 
     def axes_covariance(self, variance: float, pieces: Blocks, owner: Tensor) -> Tensor:
         """Return the covariance (6 K, 6 K) of the axes: of errors of a variance, and of what differs between clusters.
@@ -205,14 +212,14 @@ def _spread(systems: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
 
 def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
     size = mechanism.values.shape[1]
-    system = _System.of(surfaces.blocks(mechanism.motions(), label, scale), mechanism, surfaces.size)
+    system = _System.of(surfaces, mechanism, label, scale)
     if not axes:
         step = -torch.linalg.solve(system.sums.local, system.sums.local_gradient)
         return mechanism.stepped(step[:, :6], step[:, 6:], torch.zeros(size, 6).double())
     solved, reduced, gradient = system.sums.eliminated()
     step = -torch.linalg.solve(reduced.sum(0) + torch.diag(system.hold), gradient.sum(0))
     own_step = -(solved[..., -1] + solved[..., :-1] @ step)
-    return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step.reshape(size, 6))
+    return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step[: 6 * size].reshape(size, 6))
 
 
 def axis_stds(
@@ -220,9 +227,9 @@ def axis_stds(
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
     motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)
-    system = _System.of(surfaces.blocks(motions, label, scale), mechanism, surfaces.size)
+    system = _System.of(surfaces, mechanism, label, scale)
     everything = system.axes_covariance(noise.sigma**2 * noise.repeats, *surfaces.piecewise(motions, label, scale))
-    own = everything.reshape(size, 6, size, 6)[range(size), :, range(size)]
+    own = everything[: 6 * size, : 6 * size].reshape(size, 6, size, 6)[range(size), :, range(size)]
     turns = mechanism.axes[:, 3:].any(-1)
     directions = torch.where(turns.unsqueeze(-1), mechanism.axes[:, 3:], mechanism.axes[:, :3])
     # A twist (v, w) turns a direction a by w x a, and moves a point p of the axis by v + w x p, what counts across it.

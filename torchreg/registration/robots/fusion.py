@@ -41,6 +41,7 @@ class FusedScans:
         normals: T tensors of their normals.
         centers: (K, 3) of the links in the reference.
         size: diagonal of the samples, the unit of angles.
+        reference: number of the frame that does not move.
     """
 
     scans: Sequence[Target]
@@ -51,9 +52,12 @@ class FusedScans:
     normals: Sequence[Tensor]
     centers: Tensor
     size: float
+    reference: int
 
     @classmethod
-    def of(cls, scans: Sequence[Target], surfaces: Surfaces, label: Tensor, motions: Tensor) -> FusedScans:
+    def of(
+        cls, scans: Sequence[Target], surfaces: Surfaces, label: Tensor, motions: Tensor, reference: int
+    ) -> FusedScans:
         """Return the scans of all frames, each to compare with the others.
 
         A point belongs to the link of the nearest of the samples (n,) under the motions (F, K, 4, 4) of their links,
@@ -92,6 +96,7 @@ class FusedScans:
             normals=[normals[other] for other in others],
             centers=(member.mT @ points) / member.sum(0).clamp_min(1).unsqueeze(-1),
             size=size,
+            reference=reference,
         )
 
     def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:

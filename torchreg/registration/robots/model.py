@@ -136,8 +136,8 @@ def find_robot(
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
     fit: tuple[HasBlocks, Mechanism, Noise] = surfaces, mechanism, noise
     if sparse:
-        fused, whole = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label)
-        mechanism, fit = whole.seen_from(reference), (fused, whole, fused.noise(whole.motions()))
+        fused, whole = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label, reference)
+        mechanism, fit = whole.without_frame(reference), (fused, whole, fused.noise(whole.motions()))
         motions = mechanism.motions()
     loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
@@ -160,15 +160,15 @@ def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tupl
 
 
 def compared_with_each_other(
-    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor
+    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor, reference: int
 ) -> tuple[FusedScans, Mechanism]:
     """Return all scans on the links (n,) of samples, and the mechanism fitted to what each scan shows with the others.
 
-    The reference is a frame as any other: an error of its own would turn the axes by as much as joints turn little.
+    The reference is a frame as any other but that it stays.
     """
     for _ in range(MODEL.fusions):
         motions = mechanism.motions()
-        fused = FusedScans.of(scans, surfaces, label, motions)
+        fused = FusedScans.of(scans, surfaces, label, motions, reference)
         sigma = fused.noise(motions).sigma
         mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
         before, after = (surfaces.moved(own[:, label])[0] for own in (motions, mechanism.motions()))

@@ -119,6 +119,7 @@ class Surfaces:
     patch: Tensor  # (n,) patch of each sample
     targets: tuple[Target, ...]  # T scans
     size: float  # diagonal of the samples
+    reference: None = None  # no frame: the samples stay
 
     @classmethod
     def of(cls, samples: Tensor, normals: Tensor, targets: Sequence[Target]) -> Surfaces:
