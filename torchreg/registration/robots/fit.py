@@ -79,6 +79,12 @@ class Mechanism:
         kept = torch.arange(len(self.values)) != frame
         return replace(self, base=self.base[kept], values=self.values[kept])
 
+    def steps_from(self, before: Mechanism) -> Tensor:
+        """Return the twists (K, 6) that took the joints' axes from where they were before, at most across them."""
+        along, turn = self.axes[:, 3:], torch.linalg.cross(before.axes[:, 3:], self.axes[:, 3:])
+        shift = self.axes[:, :3] - before.axes[:, :3] - torch.linalg.cross(turn, before.axes[:, :3])
+        return torch.cat([torch.linalg.cross(along, shift), turn], -1)
+
     def stepped(self, base: Tensor, values: Tensor, axes: Tensor) -> Mechanism:
         """Return the mechanism after steps of the base (T, 6), the values (T, K) and the axes, twists (K, 6)."""
         moved = (adjoint(se3_exp(axes)) @ self.axes.unsqueeze(-1)).squeeze(-1)
@@ -223,13 +229,17 @@ def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float
 
 
 def axis_stds(
-    surfaces: HasBlocks, mechanism: Mechanism, noise: Noise, label: Tensor, points: Tensor
+    surfaces: HasBlocks, mechanism: Mechanism, noise: Noise, steps: Tensor, label: Tensor, points: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
+    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3).
+
+    ``steps``: (K, 6) last steps of the axes. As each is about half of the one before, as much is left.
+    """
     motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)
     system = _System.of(surfaces, mechanism, label, scale)
     everything = system.axes_covariance(noise.sigma**2 * noise.repeats, *surfaces.piecewise(motions, label, scale))
     own = everything[: 6 * size, : 6 * size].reshape(size, 6, size, 6)[range(size), :, range(size)]
+    own = own + steps.unsqueeze(-1) * steps.unsqueeze(-2)
     turns = mechanism.axes[:, 3:].any(-1)
     directions = torch.where(turns.unsqueeze(-1), mechanism.axes[:, 3:], mechanism.axes[:, :3])
     # A twist (v, w) turns a direction a by w x a, and moves a point p of the axis by v + w x p, what counts across it.

@@ -134,10 +134,10 @@ def find_robot(
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
-    fit: tuple[HasBlocks, Mechanism, Noise] = surfaces, mechanism, noise
+    fit: tuple[HasBlocks, Mechanism, Noise, Tensor] = surfaces, mechanism, noise, torch.zeros_like(mechanism.axes)
     if sparse:
-        fused, whole = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label, reference)
-        mechanism, fit = whole.without_frame(reference), (fused, whole, fused.noise(whole.motions()))
+        fit = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label, reference)
+        mechanism = fit[1].without_frame(reference)
         motions = mechanism.motions()
     loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
@@ -161,20 +161,20 @@ def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tupl
 
 def compared_with_each_other(
     scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor, reference: int
-) -> tuple[FusedScans, Mechanism]:
+) -> tuple[FusedScans, Mechanism, Noise, Tensor]:
     """Return all scans on the links (n,) of samples, and the mechanism fitted to what each scan shows with the others.
 
-    The reference is a frame as any other but that it stays.
+    With them come the noise, and the last steps (K, 6) of the axes. The reference is a frame as any other, but stays.
     """
     for _ in range(MODEL.fusions):
-        motions = mechanism.motions()
+        before, motions = mechanism, mechanism.motions()
         fused = FusedScans.of(scans, surfaces, label, motions, reference)
-        sigma = fused.noise(motions).sigma
-        mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
-        before, after = (surfaces.moved(own[:, label])[0] for own in (motions, mechanism.motions()))
-        if float((after - before).norm(dim=-1).mean()) < MODEL.still * sigma:
+        noise = fused.noise(motions)
+        mechanism = fitted(fused, before, label, [scale * noise.sigma for scale in MODEL.kernels])
+        old, new = (surfaces.moved(own[:, label])[0] for own in (motions, mechanism.motions()))
+        if float((new - old).norm(dim=-1).mean()) < MODEL.still * noise.sigma:
             break
-    return fused, mechanism
+    return fused, mechanism, noise, mechanism.steps_from(before)
 
 
 def without_welds(
