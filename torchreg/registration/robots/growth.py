@@ -71,7 +71,7 @@ class Growth:
         best = found.motions[:, [found.costs(found.motions).mean(0).argmin()]]
         # Kernels that are wide for a link that moved a little may leave one that did not.
         tried = torch.cat([best, *(found._fitted(best, everything, at) for at in (GROWTH.root, GROWTH.others))], 1)
-        return replace(found, motions=tried[:, [found.costs(tried).mean(0).argmin()]])._labeled()
+        return replace(found, motions=tried[:, [found.costs(tried).mean(0).argmin()]]).labeled()
 
     def costs(self, motions: Tensor, which: Tensor | slice = slice(None)) -> Tensor:
         """Return the costs (k, K) of samples under motions (T, K, 4, 4), means over the scans; one of outliers."""
@@ -98,7 +98,7 @@ class Growth:
         kernels = [scale * self.surfaces.spacing for scale in scales]
         return own.refined(motions, torch.zeros_like(which), kernels)
 
-    def _labeled(self) -> Growth:
+    def labeled(self) -> Growth:
         """Return the links with the samples that each explains, by the costs of samples and of their neighbors."""
         costs, (first, second) = self.costs(self.motions), self.surfaces.edges.mT
         around = torch.zeros_like(costs).index_add(0, first, costs[second]).index_add(0, second, costs[first])
@@ -113,7 +113,7 @@ class Growth:
         """
         grown, number, new = self, self.motions.shape[1], motion.unsqueeze(1)
         for turns in (False, False, True, True):
-            grown = replace(self, motions=torch.cat([self.motions, new], 1))._labeled()
+            grown = replace(self, motions=torch.cat([self.motions, new], 1)).labeled()
             own = (grown.label == number).nonzero()[:, 0]
             if len(own) < GROWTH.least:
                 return self
@@ -123,7 +123,7 @@ class Growth:
             motions = torch.cat(tried, 1)
             best = grown._frame_costs(motions, own).mean(-1).argmin(1)
             new = motions[torch.arange(len(motions)), best].unsqueeze(1)
-        return replace(self, motions=torch.cat([self.motions, new], 1))._labeled()
+        return replace(self, motions=torch.cat([self.motions, new], 1)).labeled()
 
     def _turned(self, parent: int, own: Tensor) -> list[Tensor]:
         """Return the best turns (T, 1, 4, 4) of the last link's samples (k,) about the hinge of most of its motions."""
@@ -192,14 +192,14 @@ class Growth:
         return best
 
 
-def grown(surfaces: Surfaces, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the motions (T, K, 4, 4) of links, and the labels (n,) of the samples.
+def grown(state: Growth) -> tuple[Tensor, Tensor]:
+    """Return the motions (T, K, 4, 4) of links, and the labels (n,) of the samples, from links found so far.
 
-    The first link is what follows one of the motions (T, S, 4, 4), or did not move. Where samples that it does not
-    explain begin, the next link turns about a point: its rotation in each scan is one of all, and about one axis in all
-    scans, if these data agree with that. What it explains is its own, and its end is where the next one begins.
+    Where samples that these do not explain begin, the next link turns about a point: its rotation in each scan is one
+    of all, and about one axis in all scans, if these data agree with that. What it explains is its own, and its end is
+    where the next one begins.
     """
-    state, failed = Growth.rooted(surfaces, start), set[tuple[int, ...]]()
+    failed = set[tuple[int, ...]]()
     while state.motions.shape[1] < GROWTH.most:
         clouds, best = state.open_clouds(), dict[int, tuple[float, Tensor, int]]()
         for front in state.fronts():
@@ -217,5 +217,6 @@ def grown(surfaces: Surfaces, start: Tensor) -> tuple[Tensor, Tensor]:
         if state.motions.shape[1] == before:
             break
     known = state.label >= 0
-    nearest = NeighborTree(surfaces.samples[known]).nearest(surfaces.samples)[0]
+    samples = state.surfaces.samples
+    nearest = NeighborTree(samples[known]).nearest(samples)[0]
     return state.motions, state.label[known][nearest]

@@ -124,9 +124,9 @@ def find_robot(
     order = even_order(points, min(len(points), MODEL.samples))
     surfaces = Surfaces.of(points[order], normals[order], [scans[frame] for frame in frames.tolist()])
     motions, label = without_gaps(moved[frames], part[order])
-    if sparse:
-        motions, label = with_grown_links(surfaces, motions, label)
     for _ in range(MODEL.rounds):
+        if sparse:
+            motions, label = with_grown_links(surfaces, motions, label)
         motions, label, noise = find_links(surfaces, motions, label)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
         mechanism, label = assembled(surfaces, motions, label, joints, noise)
@@ -152,11 +152,10 @@ def find_robot(
 def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
     """Return motions (T, K, 4, 4) and labels (n,), those of links found one after another where parts do not fit."""
     motions = surfaces.refined(motions, label, [scale * surfaces.spacing for scale in GROWTH.others])
-    costs = Growth(surfaces, motions, label).costs(motions).gather(1, label.unsqueeze(1))
-    if float((costs < GROWTH.explained).double().mean()) > GROWTH.registered:
-        return motions, label
-    found, new = grown(surfaces, motions)
-    return torch.cat([motions, found], 1), new + motions.shape[1]
+    state = Growth(surfaces, motions, label).labeled()
+    if float((state.label >= 0).double().mean()) < GROWTH.registered:
+        state = Growth.rooted(surfaces, motions)
+    return grown(state)
 
 
 def compared_with_each_other(
