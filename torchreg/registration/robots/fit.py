@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchreg.geometry.rigid import adjoint, se3_exp
 from torchreg.geometry.rotation import skew
+from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
 
 
@@ -26,26 +27,8 @@ class FitNumbers:
 FIT = FitNumbers()
 
 
-class HasBlocks(Protocol):
-    """Data with normal equations of the motions of parts: samples and scans, or scans among each other."""
-
-    @property
-    def size(self) -> float:
-        """Diagonal of the samples."""
-        ...
-
-    @property
-    def reference(self) -> int | None:
-        """Number of the frame that stays, where the parts are made of all scans and move with these; or none."""
-        ...
-
-    def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
-        """Return the normal equations at the motions (T, K, 4, 4) of parts (n,)."""
-        ...
-
-    def piecewise(self, motions: Tensor, label: Tensor, scale: float) -> tuple[Blocks, Tensor]:
-        """Return those of pieces of parts, about the parts' centers, and the part (P,) of each."""
-        ...
+# What is fitted: samples to scans, or scans to each other.
+Data = Surfaces | FusedScans
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +91,7 @@ class Mechanism:
 
 
 def fitted(
-    surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
+    surfaces: Data, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
 ) -> Mechanism:
     """Return the mechanism after a Gauss-Newton step of point-to-plane residuals at each of some robust scales."""
     for scale in scales:
@@ -160,7 +143,7 @@ class _System:
     hold: Tensor
 
     @classmethod
-    def of(cls, data: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
+    def of(cls, data: Data, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
         """Return the system of the normal equations of all parts at a robust scale."""
         motions, (frames, size) = mechanism.motions(), mechanism.values.shape
         blocks = data.blocks(motions, label, scale)
@@ -216,7 +199,7 @@ def _spread(systems: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
     return (count - 1) / count * moved.mT @ moved * (count >= 3)
 
 
-def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
+def _step(surfaces: Data, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
     size = mechanism.values.shape[1]
     system = _System.of(surfaces, mechanism, label, scale)
     if not axes:
@@ -229,7 +212,7 @@ def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float
 
 
 def axis_stds(
-    surfaces: HasBlocks, mechanism: Mechanism, noise: Noise, steps: Tensor, label: Tensor, points: Tensor
+    surfaces: Data, mechanism: Mechanism, noise: Noise, steps: Tensor, label: Tensor, points: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3).
 

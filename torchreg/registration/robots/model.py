@@ -20,7 +20,7 @@ from torchreg.geometry.poisson_disk import poisson_disk
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
-from torchreg.registration.robots.fit import HasBlocks, Mechanism, axis_stds, fitted, settled
+from torchreg.registration.robots.fit import Data, Mechanism, axis_stds, fitted, settled
 from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.growth import GROWTH, Growth, grown
 from torchreg.registration.robots.joints import Candidate, best_joint, from_ground, relative
@@ -134,7 +134,7 @@ def find_robot(
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
-    fit: tuple[HasBlocks, Mechanism, Noise, Tensor] = surfaces, mechanism, noise, torch.zeros_like(mechanism.axes)
+    fit: tuple[Data, Mechanism, Noise, Tensor] = surfaces, mechanism, noise, torch.zeros_like(mechanism.axes)
     if sparse:
         fit = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label, reference)
         mechanism = fit[1].without_frame(reference)
