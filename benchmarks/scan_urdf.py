@@ -160,8 +160,11 @@ def scattered(mesh: tr.TriangleMesh, count: int, generator: torch.Generator) -> 
     return (shares.unsqueeze(-1) * chosen).sum(1) / shares.sum(-1, keepdim=True)
 
 
-def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int]:
-    """Print the figures of an arm in clouds all around; return how many joints are right, and how many there are."""
+def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int, list[float]]:
+    """Print the figures of an arm in clouds all around.
+
+    Returns how many joints are right, how many there are, and the errors of the right ones' directions in stds.
+    """
     arm, scans = around(arm, torch.Generator().manual_seed(seed))
     begin = time.process_time()
     found = tr.register_sequence(scans, reference="auto")
@@ -169,17 +172,19 @@ def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int]:
         robot = found.to_urdf(Path(folder) / "robot.urdf")
     spent = time.process_time() - begin
     size = float((arm.placed()[0].amax(0) - arm.placed()[0].amin(0)).norm())
-    angles, across = axis_errors(replace(arm, poses=arm.poses[found.reference :]), robot)
+    angles, across, nearest = axis_errors(replace(arm, poses=arm.poses[found.reference :]), robot)
     right = (angles < DEGREES) & (across < SHARE * size)
+    stds = torch.rad2deg(robot.axis_std)
+    wrong = sorted({n for n in range(len(stds)) if stds[n] < DEGREES} - set(nearest[right].tolist()))
     print(
-        f"{name}: {int(right.sum())} of {len(right)} joints right, {len(robot.tree) - 1} found, axes off "
-        f"{', '.join(f'{a:.1f}' for a in angles.tolist())} degrees, "
-        f"{', '.join(f'{100 * a / size:.1f}' for a in across.tolist())} % of the size; "
-        f"stds found {', '.join(f'{a:.1f}' for a in torch.rad2deg(robot.axis_std).tolist())} degrees; "
+        f"{name}: {int(right.sum())} of {len(right)} joints right, {len(stds)} found, axes off "
+        f"{', '.join(f'{a:.2f}' for a in angles.tolist())} degrees, "
+        f"{', '.join(f'{100 * a / size:.1f}' for a in across.tolist())} % of the size; stds found "
+        f"{', '.join(f'{a:.2f}' for a in stds.tolist())} degrees, {len(wrong)} wrong ones below {DEGREES:.0f}; "
         f"{found.status}, {spent:.0f} CPU s",
         flush=True,
     )
-    return int(right.sum()), len(right)
+    return int(right.sum()), len(right), (angles / stds[nearest])[right].tolist()
 
 
 def show_hexapod(folder: Path, generator: torch.Generator | None) -> None:
@@ -284,8 +289,8 @@ def rand_index(first: Tensor, second: Tensor) -> float:
     return (total + 2 * both - pairs(table.sum(0)) - pairs(table.sum(1))) / total
 
 
-def axis_errors(arm: Arm, robot: RobotModel) -> tuple[Tensor, Tensor]:
-    """Return the angles (J,), degrees, of the true axes from the nearest found, and those joints' distances."""
+def axis_errors(arm: Arm, robot: RobotModel) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the angles (J,), degrees, and distances of the true axes from the nearest found, and which those are."""
     axes, points = arm.axes()
     found = torch.tensor([joint.axis for joint in robot.tree.joints[1:]], dtype=torch.float64).reshape(-1, 3)
     off = robot.origins()[1:] - points.unsqueeze(1)
@@ -293,7 +298,7 @@ def axis_errors(arm: Arm, robot: RobotModel) -> tuple[Tensor, Tensor]:
     angle = (axes @ found.mT).abs().clamp_max(1).arccos()
     # A radian counts as much as half a metre, about the size of an arm.
     nearest = (0.5 * angle + across).argmin(1, keepdim=True)
-    return torch.rad2deg(angle.gather(1, nearest)[:, 0]), across.gather(1, nearest)[:, 0]
+    return torch.rad2deg(angle.gather(1, nearest)[:, 0]), across.gather(1, nearest)[:, 0], nearest[:, 0]
 
 
 def show(arm: Arm, name: str, as_clouds: bool) -> None:
@@ -322,7 +327,7 @@ def show(arm: Arm, name: str, as_clouds: bool) -> None:
     moved = (chosen[..., :3, :3] @ local.unsqueeze(-1)).squeeze(-1) + chosen[..., :3, 3]
     size = float((placed[0].amax(0) - placed[0].amin(0)).norm())
     off = (moved - moved[:1] - placed[:, vertex] + placed[:1, vertex]).norm(dim=-1).median(-1).values / size
-    angles, across = axis_errors(arm, robot)
+    angles, across, _ = axis_errors(arm, robot)
     kinds = [joint.kind for joint in robot.tree.joints[1:]]
     print(
         f"{name}: {kinds.count('revolute')} hinges and {kinds.count('prismatic')} sliders found, Rand "
@@ -362,7 +367,11 @@ def main(arguments: list[str] | None = None) -> int:
             for joints in () if options.robot else options.joints:
                 arm = Arm.drawn(joints, options.frames, seed=seed + joints)
                 counts.append(show_around(arm, f"{joints} joints, seed {seed}", seed))
-        print("{} of {} joints right".format(*map(sum, zip(*counts, strict=True))))
+        errors = torch.tensor([error for *_, errors in counts for error in errors])
+        print(
+            f"{sum(row[0] for row in counts)} of {sum(row[1] for row in counts)} joints right, their directions off by "
+            f"{errors.quantile(0.5):.1f} stds in the median, {errors.quantile(0.95):.1f} in 95 of 100"
+        )
         return 0
     if options.robot:
         for path in options.robot:

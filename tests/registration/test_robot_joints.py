@@ -18,10 +18,11 @@ SECOND_AXIS = torch.nn.functional.normalize(torch.tensor([0.8, -0.6, 0.4], dtype
 SECOND = torch.cat([torch.linalg.cross(POINT + torch.tensor([0.02, 0.03, 0.0]).double(), SECOND_AXIS), SECOND_AXIS])
 
 
-def found(kind, seed, directions=6):
+def found(kind, seed, directions=6, wrong=0):
     """The best joint between two links of random surfaces, given the errors of fits to noise, and its values.
 
-    ``directions`` of the second link's coordinates have normals: round things determine fewer.
+    ``directions`` of the second link's coordinates have normals: round things determine fewer. In the first frames,
+    ``wrong`` of them, the second link is somewhere else.
     """
     draw = {"generator": seeded(seed), "dtype": D}
     values, others = 0.4 * torch.randn(2, FRAMES, **draw)
@@ -32,6 +33,7 @@ def found(kind, seed, directions=6):
         joint = se3_exp(values.unsqueeze(-1) * torch.cat(twist["revolute"])) @ se3_exp(others.unsqueeze(-1) * SECOND)
     elif kind != "free":
         joint = se3_exp(values.unsqueeze(-1) * torch.cat(twist[kind]))
+    joint[:wrong] = joint[:wrong] @ se3_exp(0.5 * torch.randn(wrong, 6, **draw))
     motions, rows, centers = torch.stack([moved, moved @ joint], 1), [], []
     for link, held in enumerate((6, directions)):
         points = transform_points(motions[:, link], 0.2 * torch.randn(SAMPLES, 3, **draw) + link * 0.3)
@@ -69,6 +71,15 @@ def test_the_kind_of_a_joint_is_found_with_its_axis_and_values(kind, seed):
     if kind == "revolute":
         point = torch.linalg.cross(joint.twists[0, 3:], joint.twists[0, :3])
         assert float(torch.linalg.cross(point - POINT, AXIS).norm()) < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_hinge_is_found_though_a_third_of_the_frames_is_wrong(seed):
+    joint, values = found("revolute", seed, wrong=3)
+    assert (joint.kind, joint.length < 0) == ("revolute", True)
+    cosine = float(joint.twists[0, 3:] @ AXIS)
+    assert abs(cosine) > math.cos(math.radians(0.5))
+    torch.testing.assert_close(math.copysign(1, cosine) * joint.values[3:, 0], values[3:], atol=3e-3, rtol=0)
 
 
 def test_what_the_data_do_not_hold_is_no_reason_for_a_joint():

@@ -115,6 +115,25 @@ def test_things_that_do_not_move_are_one_link(scans, tmp_path):
         write_robot(tmp_path / "rock.xml", found, points, faces)
 
 
+@pytest.mark.parametrize("floats", [False, True])
+def test_what_turns_about_an_axis_that_stands_still_has_a_base(scans, bones, floats):
+    points, faces, _, part, _ = scans
+    axis, point = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64), torch.tensor([0.1, 0.2, 0.0], dtype=torch.float64)
+    values = 0.4 * bones.draw(6, 1)
+    values[0] = 0
+    twists = values * torch.cat([torch.linalg.cross(point, axis), axis]) + floats * 0.3 * bones.draw(6, 6, seed=1)
+    turns = se3_exp(twists - twists[0])
+    moved = points @ turns[:, :3, :3].mT + turns[:, None, :3, 3] + NOISE * bones.draw(6, *points.shape, seed=2)
+    found = find_robot(points, tr.RangeScan(points, faces).normals, moved, torch.zeros_like(part))
+    if floats:
+        assert len(found.tree) == 1
+        torch.testing.assert_close(found.base, turns, atol=5e-3, rtol=0)
+    else:
+        assert [joint.kind for joint in found.tree.joints] == ["fixed", "revolute"]
+        assert abs(float(torch.tensor(found.tree.joints[1].axis).double() @ axis)) > math.cos(math.radians(0.2))
+        torch.testing.assert_close(found.base, torch.eye(4).double().expand_as(found.base))
+
+
 def test_clouds_without_triangles_become_closed_links(scans, found, tmp_path):
     points, faces, deformed, _, _ = scans
     generator = torch.Generator().manual_seed(1)

@@ -234,7 +234,10 @@ def _write_robot(
                     f"torchreg: {name} does not explain how its two links move: a part between may be missing", err=True
                 )
             for name in robot.undetermined:
-                typer.echo(f"torchreg: the axis of {name} is not determined: it hardly moved", err=True)
+                typer.echo(
+                    f"torchreg: the axis of {name} is not determined: it hardly moved, or its link was not found",
+                    err=True,
+                )
     if not found.status.usable:
         raise typer.Exit(ExitCode.UNUSABLE)
 

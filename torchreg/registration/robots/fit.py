@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchreg.geometry.rigid import adjoint, se3_exp
 from torchreg.geometry.rotation import skew
+from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
 
 
@@ -26,17 +27,8 @@ class FitNumbers:
 FIT = FitNumbers()
 
 
-class HasBlocks(Protocol):
-    """Data with normal equations of the motions of parts: samples and scans, or scans among each other."""
-
-    @property
-    def size(self) -> float:
-        """Diagonal of the samples."""
-        ...
-
-    def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
-        """Return the normal equations at the motions (T, K, 4, 4) of parts (n,)."""
-        ...
+# What is fitted: samples to scans, or scans to each other.
+Data = Surfaces | FusedScans
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +39,7 @@ class Mechanism:
     axes: Tensor  # (K, 6) twists of the joints about which links move, unit turns or slides; zero for the root
     base: Tensor  # (T, 4, 4) motions of the root
     values: Tensor  # (T, K), radians or lengths; zero for the root
+    held: bool = False  # whether the root stays where it is
 
     def motions(self) -> Tensor:
         """Return the motions (T, K, 4, 4) of all links."""
@@ -55,6 +48,25 @@ class Mechanism:
         for link, parent in enumerate(self.parents):
             found.append(self.base if parent < 0 else found[parent] @ turns[:, link])
         return torch.stack(found, 1)
+
+    def with_frame(self, frame: int) -> Mechanism:
+        """Return the mechanism in one more frame, that in whose coordinates it is."""
+        base, values = (
+            torch.cat([rows[:frame], new.unsqueeze(0), rows[frame:]])
+            for rows, new in ((self.base, torch.eye(4).double()), (self.values, torch.zeros_like(self.axes[:, 0])))
+        )
+        return replace(self, base=base, values=values)
+
+    def without_frame(self, frame: int) -> Mechanism:
+        """Return the mechanism in one frame less."""
+        kept = torch.arange(len(self.values)) != frame
+        return replace(self, base=self.base[kept], values=self.values[kept])
+
+    def steps_from(self, before: Mechanism) -> Tensor:
+        """Return the twists (K, 6) that took the joints' axes from where they were before, at most across them."""
+        along, turn = self.axes[:, 3:], torch.linalg.cross(before.axes[:, 3:], self.axes[:, 3:])
+        shift = self.axes[:, :3] - before.axes[:, :3] - torch.linalg.cross(turn, before.axes[:, :3])
+        return torch.cat([torch.linalg.cross(along, shift), turn], -1)
 
     def stepped(self, base: Tensor, values: Tensor, axes: Tensor) -> Mechanism:
         """Return the mechanism after steps of the base (T, 6), the values (T, K) and the axes, twists (K, 6)."""
@@ -79,7 +91,7 @@ class Mechanism:
 
 
 def fitted(
-    surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
+    surfaces: Data, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
 ) -> Mechanism:
     """Return the mechanism after a Gauss-Newton step of point-to-plane residuals at each of some robust scales."""
     for scale in scales:
@@ -87,8 +99,7 @@ def fitted(
     return mechanism
 
 
-@dataclass(frozen=True, eq=False)
-class _System:
+class _Sums(NamedTuple):
     """Gauss-Newton system of all frames: steps of each frame, D = 6 + K numbers, and of the axes, 6 K in all."""
 
     local: Tensor
@@ -96,31 +107,21 @@ class _System:
     mixed: Tensor
     outer: Tensor  # (T, 6 K, 6 K)
     outer_gradient: Tensor  # (T, 6 K)
-    hold: Tensor
 
     @classmethod
-    def of(cls, surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
-        motions = mechanism.motions()
-        blocks = surfaces.blocks(motions, label, scale)
-        frames, size = mechanism.values.shape
-        by_value, by_axis = mechanism.jacobians(motions)
-        # Twists about the origin move a part's center c by v + w x c.
-        change = torch.eye(6).double().repeat(frames, size, 1, 1)
-        change[..., :3, 3:] = -skew(blocks.centers)
-        own = change @ torch.cat([torch.eye(6).double().expand(frames, size, 6, 6), by_value], -1)
-        shared = change @ by_axis.flatten(-2)
-        metric = torch.tensor([1.0] * 3 + [(0.5 * surfaces.size) ** 2] * 3, dtype=torch.float64)
-        weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
-        hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
-        local = (own.mT @ hessian @ own).sum(1)
+    def of(cls, own: Tensor, shared: Tensor, hessian: Tensor, gradient: Tensor) -> _Sums:
+        """Return the sums over parts (T, K, 6, ...) that steps of frames and axes move by (..., D) and (..., 6 K)."""
         return cls(
-            local=local + 1e-9 * torch.diag_embed(local.diagonal(dim1=-2, dim2=-1) + weight.mean()),
-            local_gradient=(own.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1),
+            local=(own.mT @ hessian @ own).sum(1),
+            local_gradient=(own.mT @ gradient.unsqueeze(-1)).sum(1).squeeze(-1),
             mixed=(own.mT @ hessian @ shared).sum(1),
             outer=(shared.mT @ hessian @ shared).sum(1),
-            outer_gradient=(shared.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1),
-            hold=FIT.damping * weight.mean() * metric.repeat(size) + 1e-9,
+            outer_gradient=(shared.mT @ gradient.unsqueeze(-1)).sum(1).squeeze(-1),
         )
+
+    def without(self, piece: _Sums) -> _Sums:
+        """Return what is left of the sums without some of their terms."""
+        return _Sums(*(whole - part for whole, part in zip(self, piece, strict=True)))
 
     def eliminated(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the frames' solutions (T, D, 6 K + 1), and their shares of the system of the axes (Schur complement).
@@ -131,41 +132,97 @@ class _System:
         gradient = self.outer_gradient - (self.mixed.mT @ solved[..., -1:]).squeeze(-1)
         return solved, self.outer - self.mixed.mT @ solved[..., :-1], gradient
 
-    def axes_covariance(self, variance: float) -> Tensor:
-        """Return the covariance (6 K, 6 K) of the axes: of errors of a variance, and of what differs between frames.
 
-        What the points of a frame share, the noise of their residuals does not show; it shows in how far the axes move
-        when a frame is left out, here by one step each (the cluster jackknife of survey statistics).
+@dataclass(frozen=True, eq=False)
+class _System:
+    """The system of all parts, and what it is made of."""
+
+    own: Tensor  # (T, K, 6, D) the parts' twists by steps of their frames
+    shared: Tensor  # (T, K, 6, 6 K) by steps of the axes, (T, K, 6, 12 K) with those of the parts, made of all scans
+    sums: _Sums
+    hold: Tensor
+
+    @classmethod
+    def of(cls, data: Data, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
+        """Return the system of the normal equations of all parts at a robust scale."""
+        motions, (frames, size) = mechanism.motions(), mechanism.values.shape
+        blocks = data.blocks(motions, label, scale)
+        by_value, by_axis = mechanism.jacobians(motions)
+        # Twists about the origin move a part's center c by v + w x c.
+        change = torch.eye(6).double().repeat(frames, size, 1, 1)
+        change[..., :3, 3:] = -skew(blocks.centers)
+        by_base = torch.eye(6).double() * (not mechanism.held)
+        own = change @ torch.cat([by_base.expand(frames, size, 6, 6), by_value], -1)
+        shared = change @ by_axis.flatten(-2)
+        if data.reference is not None:
+            # Parts stay where the other scans put them only until these move: without that, steps are far too short.
+            own[data.reference] = 0
+            parts = torch.zeros(frames, size, 6, size, 6, dtype=torch.float64)
+            parts[:, range(size), :, range(size)] = (change @ adjoint(motions)).transpose(0, 1)
+            shared = torch.cat([shared, parts.flatten(-2)], -1)
+        metric = torch.tensor([1.0] * 3 + [(0.5 * data.size) ** 2] * 3, dtype=torch.float64)
+        weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
+        hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
+        sums = _Sums.of(own, shared, hessian, blocks.gradient)
+        local = sums.local + 1e-9 * torch.diag_embed(sums.local.diagonal(dim1=-2, dim2=-1) + weight.mean())
+        hold = FIT.damping * weight.mean() * metric.repeat(shared.shape[-1] // 6) + 1e-9
+        return cls(own, shared, sums._replace(local=local), hold)
+
+    def axes_covariance(self, variance: float, pieces: Blocks, owner: Tensor) -> Tensor:
+        """Return the covariance (6 K, 6 K) of the axes: of errors of a variance, and of what differs between clusters.
+
+        What the points of a frame share, or those of a piece (P,) of a link in all frames, the noise of their residuals
+        does not show; it shows in how far the axes move when one is left out, here by one step each (the cluster
+        jackknife of survey statistics, in two directions: Cameron, Gelbach and Miller 2011).
         """
-        _, matrices, gradients = self.eliminated()
-        everything, count = matrices.sum(0) + torch.diag(self.hold), len(matrices)
-        covariance = variance * torch.linalg.pinv(everything, hermitian=True)
-        if count < 3:
-            return covariance
-        moved = torch.linalg.solve(everything - matrices, gradients.unsqueeze(-1)).squeeze(-1)
-        moved = moved - moved.mean(0)
-        return covariance + (count - 1) / count * moved.mT @ moved
+        _, matrices, gradients = self.sums.eliminated()
+        everything = matrices.sum(0) + torch.diag(self.hold)
+        without = [
+            (everything - matrix, gradients.sum(0) - gradient)
+            for matrix, gradient in zip(matrices, gradients, strict=True)
+        ]
+        covariance = variance * torch.linalg.pinv(everything, hermitian=True) + _spread(without)
+        without = []
+        for number, link in enumerate(owner.tolist()):
+            own, shared = (values[:, [link]] for values in (self.own, self.shared))
+            piece = _Sums.of(own, shared, pieces.hessian[:, [number]], pieces.gradient[:, [number]])
+            _, matrices, gradients = self.sums.without(piece).eliminated()
+            without.append((matrices.sum(0) + torch.diag(self.hold), gradients.sum(0)))
+        return covariance + _spread(without)
 
 
-def _step(surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
+def _spread(systems: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """Return the jackknife covariance (D, D) of the solutions of systems that lack a cluster each; of two, zero."""
+    matrices, gradients = (torch.stack(values) for values in zip(*systems, strict=True))
+    moved = torch.linalg.solve(matrices, gradients.unsqueeze(-1)).squeeze(-1)
+    count, moved = len(moved), moved - moved.mean(0)
+    return (count - 1) / count * moved.mT @ moved * (count >= 3)
+
+
+def _step(surfaces: Data, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
     size = mechanism.values.shape[1]
     system = _System.of(surfaces, mechanism, label, scale)
     if not axes:
-        step = -torch.linalg.solve(system.local, system.local_gradient)
+        step = -torch.linalg.solve(system.sums.local, system.sums.local_gradient)
         return mechanism.stepped(step[:, :6], step[:, 6:], torch.zeros(size, 6).double())
-    solved, reduced, gradient = system.eliminated()
+    solved, reduced, gradient = system.sums.eliminated()
     step = -torch.linalg.solve(reduced.sum(0) + torch.diag(system.hold), gradient.sum(0))
     own_step = -(solved[..., -1] + solved[..., :-1] @ step)
-    return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step.reshape(size, 6))
+    return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step[: 6 * size].reshape(size, 6))
 
 
 def axis_stds(
-    surfaces: HasBlocks, mechanism: Mechanism, label: Tensor, noise: Noise, points: Tensor
+    surfaces: Data, mechanism: Mechanism, noise: Noise, steps: Tensor, label: Tensor, points: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3)."""
-    system, size = _System.of(surfaces, mechanism, label, FIT.scales[-1] * noise.sigma), len(points)
-    everything = system.axes_covariance(noise.sigma**2 * noise.repeats)
-    own = everything.reshape(size, 6, size, 6)[range(size), :, range(size)]
+    """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3).
+
+    ``steps``: (K, 6) last steps of the axes. As each is about half of the one before, as much is left.
+    """
+    motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)
+    system = _System.of(surfaces, mechanism, label, scale)
+    everything = system.axes_covariance(noise.sigma**2 * noise.repeats, *surfaces.piecewise(motions, label, scale))
+    own = everything[: 6 * size, : 6 * size].reshape(size, 6, size, 6)[range(size), :, range(size)]
+    own = own + steps.unsqueeze(-1) * steps.unsqueeze(-2)
     turns = mechanism.axes[:, 3:].any(-1)
     directions = torch.where(turns.unsqueeze(-1), mechanism.axes[:, 3:], mechanism.axes[:, :3])
     # A twist (v, w) turns a direction a by w x a, and moves a point p of the axis by v + w x p, what counts across it.

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchreg.geometry.neighbors import NeighborTree, k_nearest_others
 from torchreg.geometry.normals import fit_normals
 from torchreg.geometry.rigid import invert_rigid
-from torchreg.registration.robots.surfaces import NUMBERS, Blocks, Noise, Target, frame_sums
+from torchreg.registration.robots.surfaces import NUMBERS, Blocks, Noise, Surfaces, Target, frame_sums
 
 
 @dataclass(frozen=True)
@@ -34,32 +34,44 @@ class FusedScans:
 
     Args:
         scans: of the T frames.
-        links: T tensors of the links of their points.
+        pieces: T tensors of the pieces of links that their points belong to.
+        owner: (P,) link of each piece.
         trees: T trees of the points of the other frames.
         points: T tensors of those points, in the reference.
         normals: T tensors of their normals.
         centers: (K, 3) of the links in the reference.
         size: diagonal of the samples, the unit of angles.
+        reference: number of the frame that does not move.
     """
 
     scans: Sequence[Target]
-    links: Sequence[Tensor]
+    pieces: Sequence[Tensor]
+    owner: Tensor
     trees: Sequence[NeighborTree]
     points: Sequence[Tensor]
     normals: Sequence[Tensor]
     centers: Tensor
     size: float
+    reference: int
 
     @classmethod
     def of(
-        cls, scans: Sequence[Target], moved: Tensor, label: Tensor, motions: Tensor, size: float, reference: int
+        cls, scans: Sequence[Target], surfaces: Surfaces, label: Tensor, motions: Tensor, reference: int
     ) -> FusedScans:
-        """Return the scans of all frames but the reference, whose pose stays, to compare with all.
+        """Return the scans of all frames, each to compare with the others.
 
-        A point belongs to the link of the nearest of the moved samples (F, n, 3), which are those of the links (n,);
-        it moves into the reference by the inverse of its motion (F, K, 4, 4).
+        A point belongs to the link of the nearest of the samples (n,) under the motions (F, K, 4, 4) of their links,
+        whose normal has the right sign; it moves into the reference by the inverse of that motion.
         """
-        links = [label[NeighborTree(own).nearest(scan.points)[0]] for scan, own in zip(scans, moved, strict=True)]
+        piece, owner = surfaces.pieces(label)
+        size, nearest, known = surfaces.size, [], []
+        for scan, moved, facing in zip(scans, *surfaces.moved(motions[:, label]), strict=True):
+            sample = NeighborTree(moved).nearest(scan.points)[0]
+            against = (facing[sample] * scan.normals).sum(-1, keepdim=True) < 0
+            known.append(scan.facing(torch.where(against, -scan.normals, scan.normals)))
+            nearest.append(sample)
+        scans, pieces = known, [piece[sample] for sample in nearest]
+        links = [owner[own] for own in pieces]
         placed = [_in_reference(*row) for row in zip(scans, links, motions, strict=True)]
         points, normals, link = (
             torch.cat([row[0] for row in placed]),
@@ -74,27 +86,34 @@ class FusedScans:
         normals = torch.where((fitted * normals).sum(-1, keepdim=True) < 0, -fitted, fitted)
         place = _place(points, normals, link, spacing, size)
         member = torch.nn.functional.one_hot(link, motions.shape[1]).to(points)
-        kept = [number for number in range(len(scans)) if number != reference]
-        others = [frame != number for number in kept]
+        others = [frame != number for number in range(len(scans))]
         return cls(
-            scans=[scans[number] for number in kept],
-            links=[links[number] for number in kept],
+            scans=scans,
+            pieces=pieces,
+            owner=owner,
             trees=[NeighborTree(place[other]) for other in others],
             points=[points[other] for other in others],
             normals=[normals[other] for other in others],
             centers=(member.mT @ points) / member.sum(0).clamp_min(1).unsqueeze(-1),
             size=size,
+            reference=reference,
         )
 
     def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
         """Return the normal equations of robust residuals at the motions (T, K, 4, 4); see `Surfaces.blocks`."""
-        centers = (motions[..., :3, :3] @ self.centers.unsqueeze(-1)).squeeze(-1) + motions[..., :3, 3]
-        rows = []
+        return self.piecewise(motions, label, scale)[0].joined(self.owner, self._centers(motions))
+
+    def piecewise(self, motions: Tensor, label: Tensor, scale: float) -> tuple[Blocks, Tensor]:
+        """Return the normal equations of pieces of links, about the links' centers, and the link (P,) of each."""
+        centers, rows = self._centers(motions)[:, self.owner], []
         for frame, (motion, center) in enumerate(zip(motions, centers, strict=True)):
             points, facing, across, square = self._residuals(frame, motion)
-            link = self.links[frame]
-            rows.append(frame_sums(points - center[link], facing, across, square / scale**2, link, motions.shape[1]))
-        return Blocks.of(torch.stack(rows), centers)
+            piece = self.pieces[frame]
+            rows.append(frame_sums(points - center[piece], facing, across, square / scale**2, piece, len(self.owner)))
+        return Blocks.of(torch.stack(rows), centers), self.owner
+
+    def _centers(self, motions: Tensor) -> Tensor:
+        return (motions[..., :3, :3] @ self.centers.unsqueeze(-1)).squeeze(-1) + motions[..., :3, 3]
 
     def noise(self, motions: Tensor) -> Noise:
         """Return the noise of the residuals under the motions (T, K, 4, 4)."""
@@ -107,7 +126,7 @@ class FusedScans:
 
         As of `Target.residuals`: across the plane, and squared with what is along it beyond the spacing.
         """
-        scan, link = self.scans[frame], self.links[frame]
+        scan, link = self.scans[frame], self.owner[self.pieces[frame]]
         points, normals = _in_reference(scan, link, motions)
         nearest = self.trees[frame].nearest(_place(points, normals, link, scan.spacing, self.size))[0]
         turn = motions[link]

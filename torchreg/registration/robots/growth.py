@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,9 +11,10 @@ from torch import Tensor
 
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.neighbors import NeighborTree
-from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
-from torchreg.registration.robots.pieces import Piece, rotations_and_hinge
-from torchreg.registration.robots.surfaces import Surfaces
+from torchreg.geometry.rigid import invert_rigid, rigid_matrix, se3_exp, transform_points
+from torchreg.registration.robots.joints import relative, shared_hinge
+from torchreg.registration.robots.pieces import PIECES, Piece, rotations_and_hinge
+from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,9 @@ class GrowthNumbers:
     most: int = 40  # links
     root: tuple[float, ...] = (8.0, 6.0, 4.0, 3.0, 2.0, 1.0, 1.0)  # kernels by which the first link is fitted
     others: tuple[float, ...] = (2.0, 1.0, 1.0)  # and all others
+    wide: tuple[float, ...] = (4.0, 3.0, 2.0, 1.0, 1.0)  # and from turns ten degrees apart
+    turns: int = 2  # best of these, that are refined
+    noise: float = 0.3  # standard deviation of a residual
 
 
 GROWTH = GrowthNumbers()
@@ -66,10 +71,14 @@ class Growth:
         best = found.motions[:, [found.costs(found.motions).mean(0).argmin()]]
         # Kernels that are wide for a link that moved a little may leave one that did not.
         tried = torch.cat([best, *(found._fitted(best, everything, at) for at in (GROWTH.root, GROWTH.others))], 1)
-        return replace(found, motions=tried[:, [found.costs(tried).mean(0).argmin()]])._labeled()
+        return replace(found, motions=tried[:, [found.costs(tried).mean(0).argmin()]]).labeled()
 
     def costs(self, motions: Tensor, which: Tensor | slice = slice(None)) -> Tensor:
         """Return the costs (k, K) of samples under motions (T, K, 4, 4), means over the scans; one of outliers."""
+        return self._frame_costs(motions, which).mean(0).mT
+
+    def _frame_costs(self, motions: Tensor, which: Tensor | slice) -> Tensor:
+        """Return the costs (T, K, k) of samples in each scan."""
         spacing, found = self.surfaces.spacing, []
         for target, frame in zip(self.surfaces.targets, motions, strict=True):
             moved = transform_points(frame, self.surfaces.samples[which])
@@ -81,7 +90,7 @@ class Growth:
             along = ((offset.square().sum(-1) - across).clamp_min(0).sqrt() / spacing - GROWTH.along).clamp_min(0)
             square = across / spacing**2 + along.square()
             found.append(torch.where(distance.isfinite(), square, 1.0).clamp_max(1))
-        return torch.stack(found).mean(0).mT
+        return torch.stack(found)
 
     def _fitted(self, motions: Tensor, which: Tensor, scales: Sequence[float]) -> Tensor:
         """Return the motions (T, 1, 4, 4) fitted to samples (k,)."""
@@ -89,7 +98,7 @@ class Growth:
         kernels = [scale * self.surfaces.spacing for scale in scales]
         return own.refined(motions, torch.zeros_like(which), kernels)
 
-    def _labeled(self) -> Growth:
+    def labeled(self) -> Growth:
         """Return the links with the samples that each explains, by the costs of samples and of their neighbors."""
         costs, (first, second) = self.costs(self.motions), self.surfaces.edges.mT
         around = torch.zeros_like(costs).index_add(0, first, costs[second]).index_add(0, second, costs[first])
@@ -97,16 +106,36 @@ class Growth:
         best, label = (0.5 * (costs + around / degree.unsqueeze(1))).min(-1)
         return replace(self, label=torch.where(best < GROWTH.explained, label, -1))
 
-    def with_link(self, motion: Tensor) -> Growth:
-        """Return the links and one more, by its motions (T, 4, 4), unless it explains next to nothing."""
-        grown, number = self, self.motions.shape[1]
-        for scales in ((), GROWTH.others):
+    def with_link(self, motion: Tensor, parent: int) -> Growth:
+        """Return the links and one more, by its motions (T, 4, 4), unless it explains next to nothing.
+
+        Where a hinge on its parent fits the motions of most scans, turns about it are tried in all.
+        """
+        grown, number, new = self, self.motions.shape[1], motion.unsqueeze(1)
+        for turns in (False, False, True, True):
+            grown = replace(self, motions=torch.cat([self.motions, new], 1)).labeled()
             own = (grown.label == number).nonzero()[:, 0]
-            new = grown._fitted(motion.unsqueeze(1), own, scales) if scales else motion.unsqueeze(1)
-            grown = replace(self, motions=torch.cat([self.motions, new], 1))._labeled()
-            if int((grown.label == number).sum()) < GROWTH.least:
+            if len(own) < GROWTH.least:
                 return self
-        return grown
+            tried = [new, grown._fitted(new, own, GROWTH.others)]
+            if turns:
+                tried += [grown._fitted(start, own, GROWTH.wide) for start in grown._turned(parent, own)]
+            motions = torch.cat(tried, 1)
+            best = grown._frame_costs(motions, own).mean(-1).argmin(1)
+            new = motions[torch.arange(len(motions)), best].unsqueeze(1)
+        return replace(self, motions=torch.cat([self.motions, new], 1)).labeled()
+
+    def _turned(self, parent: int, own: Tensor) -> list[Tensor]:
+        """Return the best turns (T, 1, 4, 4) of the last link's samples (k,) about the hinge of most of its motions."""
+        pair, sigma = [parent, self.motions.shape[1] - 1], GROWTH.noise * self.surfaces.spacing
+        label = self.label.clamp_min(0)
+        blocks = self.surfaces.blocks(self.motions, label, NUMBERS.cut * sigma)
+        data = relative(self.motions, blocks, (pair[0], pair[1]), Noise(sigma, 1.0), self.surfaces.size)
+        axis = data.in_space(shared_hinge(data)[1])
+        angles = torch.arange(PIECES.turns, dtype=torch.float64) * (math.tau / PIECES.turns)
+        turns = self.motions[:, [parent]] @ se3_exp(angles.unsqueeze(-1) * axis)
+        best = self._frame_costs(turns, own).mean(-1).topk(GROWTH.turns, 1, largest=False).indices
+        return [turns[torch.arange(len(turns)), column].unsqueeze(1) for column in best.mT]
 
     def fronts(self) -> list[Front]:
         """Return the borders of links and of connected samples that none explains."""
@@ -163,30 +192,31 @@ class Growth:
         return best
 
 
-def grown(surfaces: Surfaces, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the motions (T, K, 4, 4) of links, and the labels (n,) of the samples.
+def grown(state: Growth) -> tuple[Tensor, Tensor]:
+    """Return the motions (T, K, 4, 4) of links, and the labels (n,) of the samples, from links found so far.
 
-    The first link is what follows one of the motions (T, S, 4, 4), or did not move. Where samples that it does not
-    explain begin, the next link turns about a point: its rotation in each scan is one of all, and about one axis in all
-    scans, if these data agree with that. What it explains is its own, and its end is where the next one begins.
+    Where samples that these do not explain begin, the next link turns about a point: its rotation in each scan is one
+    of all, and about one axis in all scans, if these data agree with that. What it explains is its own, and its end is
+    where the next one begins.
     """
-    state, failed = Growth.rooted(surfaces, start), set[tuple[int, ...]]()
+    failed = set[tuple[int, ...]]()
     while state.motions.shape[1] < GROWTH.most:
-        clouds, best = state.open_clouds(), dict[int, tuple[float, Tensor]]()
+        clouds, best = state.open_clouds(), dict[int, tuple[float, Tensor, int]]()
         for front in state.fronts():
             if front.key in failed:
                 continue
-            found = state.searched(front, clouds)
+            found = *state.searched(front, clouds), front.link
             if found[0] < GROWTH.least:
                 failed.add(front.key)
             else:
                 piece = int(front.open[0])
                 best[piece] = max(best.get(piece, found), found, key=lambda row: row[0])
         before = state.motions.shape[1]
-        for _, motion in best.values():
-            state = state.with_link(motion)
+        for _, motion, parent in best.values():
+            state = state.with_link(motion, parent)
         if state.motions.shape[1] == before:
             break
     known = state.label >= 0
-    nearest = NeighborTree(surfaces.samples[known]).nearest(surfaces.samples)[0]
+    samples = state.surfaces.samples
+    nearest = NeighborTree(samples[known]).nearest(samples)[0]
     return state.motions, state.label[known][nearest]

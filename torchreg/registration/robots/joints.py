@@ -24,6 +24,7 @@ class JointNumbers:
     directions: int = 400  # of the second of two hinges in a row, 7 degrees apart
     starts: int = 6  # best of these, or widest turns of one hinge, that are refined
     universal: int = 4  # frames from which two hinges in a row are fewer parameters than free motions
+    turned: float = 0.15  # radians from which a motion has an axis
     ridge: float = 1e-6  # of the curvature, for directions that move no joint, as a shift along its axis
 
 
@@ -49,6 +50,11 @@ class Relative:
     count: float  # effective number of residuals behind them
     center: Tensor  # (3,) between the two links
     unit: float  # length
+
+    def in_space(self, axes: Tensor) -> Tensor:
+        """Return axes (J, 6) in half sizes about the center in lengths about the origin."""
+        shift = self.unit * axes[:, :3] + torch.linalg.cross(self.center.expand(len(axes), 3), axes[:, 3:])
+        return torch.cat([shift, axes[:, 3:]], -1)
 
 
 def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Noise, size: float) -> Relative:
@@ -77,11 +83,24 @@ def relative(motions: Tensor, blocks: Blocks, pair: tuple[int, int], noise: Nois
     return Relative(seen, torch.linalg.inv(covariance), max(2.0, count), center, unit)
 
 
+def from_ground(motions: Tensor, blocks: Blocks, link: int | Tensor, noise: Noise, size: float) -> Relative:
+    """Return the motions of a link seen from the ground, which stands still without an error."""
+    still = torch.eye(4, dtype=torch.float64).expand(len(motions), 4, 4)
+    sure = torch.eye(6, dtype=torch.float64).expand(len(motions), 6, 6) / torch.finfo(torch.float64).eps
+    both = Blocks(
+        hessian=torch.stack([sure, blocks.hessian[:, link]], 1),
+        gradient=blocks.gradient[:, [link, link]],
+        centers=blocks.centers[:, [link, link]],
+        count=torch.stack([torch.zeros_like(blocks.count[:, link]), blocks.count[:, link]], 1),
+    )
+    return relative(torch.stack([still, motions[:, link]], 1), both, (0, 1), noise, size)
+
+
 def best_joint(data: Relative) -> Candidate:
     """Return the joint of least description length: squared errors in standard deviations, and parameters.
 
     Two hinges in a row, between which a link moves that no scan shows to turn, are tried where no single joint holds;
-    so is one hinge with one frame that is wrong.
+    so is one hinge with frames that are wrong.
     """
     frames, rate = len(data.motions), math.log(data.count)
     twists = se3_log(data.motions)
@@ -97,7 +116,7 @@ def best_joint(data: Relative) -> Candidate:
         "revolute": frames + 4,
         "prismatic": frames + 2,
         "universal": 2 * frames + 8,
-        "outlier": frames + 9,
+        "outlier": frames + 4,
     }
 
     def length(kind: str) -> float:
@@ -105,25 +124,44 @@ def best_joint(data: Relative) -> Candidate:
 
     if min(map(length, found)) > 0 and frames >= JOINTS.universal:
         found["universal"] = _fitted(data, _crosses(data), _two_angles(data))
-        found["outlier"] = _without_worst(data, twists, *found["revolute"][1:])
+        found["outlier"] = shared_hinge(data)
     kind = min(found, key=length)
     (_, axes, values), size = found[kind], length(kind)
     kind = "revolute" if kind == "outlier" else kind
     if kind == "prismatic":
         return Candidate(kind, axes, data.unit * values, size)
-    # From half sizes about a center back to lengths about the origin.
-    shift = data.unit * axes[:, :3] + torch.linalg.cross(data.center.expand(len(axes), 3), axes[:, 3:])
-    return Candidate(kind, torch.cat([shift, axes[:, 3:]], -1), values, size)
+    return Candidate(kind, data.in_space(axes), values, size)
 
 
-def _without_worst(data: Relative, twists: Tensor, axes: Tensor, values: Tensor) -> tuple[float, Tensor, Tensor]:
-    """Return `_fitted` of one hinge to all frames but the one that it fits least."""
-    error = se3_log(data.motions @ invert_rigid(se3_exp(values * axes)))
-    worst = int((error.unsqueeze(-2) @ data.information @ error.unsqueeze(-1)).flatten().argmax())
-    kept = torch.arange(len(values)) != worst
-    rest = replace(data, motions=data.motions[kept], information=data.information[kept])
-    cost, axes, _ = _fitted(rest, _screws(rest, twists[kept]), _angles_about(twists[kept]))
-    return cost, axes, _angles_about(twists)(axes.unsqueeze(0))[0]
+def shared_hinge(data: Relative) -> tuple[float, Tensor, Tensor]:
+    """Return the cost of one hinge, its axis (1, 6) and values (T, 1), where motions of some frames may be wrong.
+
+    Of the axes of single frames that which most frames agree with, fitted to the half of them that it fits best, then
+    to all that it fits; a frame that is wrong costs its free motion (least trimmed squares, Rousseeuw 1984).
+    """
+    frames, wrong = len(data.motions), (6 - 1) * math.log(data.count)
+    twists = se3_log(data.motions)
+    angle = twists[:, 3:].norm(dim=-1)
+    turned = (angle > JOINTS.turned).nonzero()[:, 0]
+    if len(turned) == 0:
+        return math.inf, torch.zeros(1, 6, dtype=torch.float64), torch.zeros(frames, 1, dtype=torch.float64)
+    unit = twists[turned] / angle[turned].unsqueeze(-1)
+    across = unit[:, :3] - (unit[:, :3] * unit[:, 3:]).sum(-1, keepdim=True) * unit[:, 3:]
+    axes = torch.cat([across, unit[:, 3:]], -1).unsqueeze(1)
+    values_of = _angles_about(twists)
+
+    def squares(axes: Tensor) -> Tensor:
+        error = se3_log(data.motions @ invert_rigid(se3_exp(values_of(axes) * axes)))
+        return (error.unsqueeze(-2) @ data.information @ error.unsqueeze(-1))[..., 0, 0]
+
+    axis = axes[squares(axes).log1p().sum(-1).argmin()]
+    fitted = squares(axis[None])[0]
+    for limit in (0.0, 0.0, wrong):
+        kept = fitted <= max(limit, float(fitted.sort().values[min(frames - 1, frames // 2)]))
+        rest = replace(data, motions=data.motions[kept], information=data.information[kept])
+        axis = _fitted(rest, axis[None], _angles_about(twists[kept]))[1]
+        fitted = squares(axis[None])[0]
+    return float(fitted.clamp_max(wrong).sum()), axis, values_of(axis[None])[0]
 
 
 def _angles_about(twists: Tensor) -> Callable[[Tensor], Tensor]:

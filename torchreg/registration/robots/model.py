@@ -20,10 +20,10 @@ from torchreg.geometry.poisson_disk import poisson_disk
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 from torchreg.geometry.sampling import even_order
 from torchreg.io.urdf_file.write import save_urdf
-from torchreg.registration.robots.fit import HasBlocks, Mechanism, axis_stds, fitted, settled
+from torchreg.registration.robots.fit import Data, Mechanism, axis_stds, fitted, settled
 from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.growth import GROWTH, Growth, grown
-from torchreg.registration.robots.joints import Candidate, best_joint, relative
+from torchreg.registration.robots.joints import Candidate, best_joint, from_ground, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
 from torchreg.shapes.posed_tree import PosedTree
@@ -36,6 +36,7 @@ class ModelNumbers:
     samples: int = 2500  # of the reference
     rounds: int = 2  # of links, joints and the fit of all; a third changes nothing on scans of arms
     fusions: int = 6  # of all scans to one surface, and fits to it: the axes of later ones change by tenths of degrees
+    still: float = 0.1  # standard deviations: a mean step of the samples from which a fusion is the last
     kernels: tuple[float, ...] = (5.0, 4.0, 3.0, 3.0)  # of each fit, standard deviations
     thinned: float = 0.5  # of a scan's spacing, between points of a surface that is made of all scans
     unsure: float = 0.087  # standard deviation of an axis that the scans do not determine, radians: five degrees
@@ -117,60 +118,62 @@ def find_robot(
     if scans is None:
         turned = (moved[:, part, :3, :3] @ normals.unsqueeze(-1)).squeeze(-1)
         scans = [Target(*frame) for frame in zip(deformed, turned, strict=True)]
+    if sparse:
+        scans = [Target(scan.points, scan.normals, signed=False) for scan in scans]
     frames = torch.tensor([frame for frame in range(len(deformed)) if frame != reference])
     order = even_order(points, min(len(points), MODEL.samples))
     surfaces = Surfaces.of(points[order], normals[order], [scans[frame] for frame in frames.tolist()])
     motions, label = without_gaps(moved[frames], part[order])
-    if sparse:
-        motions, label = with_grown_links(surfaces, motions, label)
     for _ in range(MODEL.rounds):
+        if sparse:
+            motions, label = with_grown_links(surfaces, motions, label)
         motions, label, noise = find_links(surfaces, motions, label)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
-        mechanism, label = assembled(surfaces, motions, label, joints)
+        mechanism, label = assembled(surfaces, motions, label, joints, noise)
         mechanism = settled(surfaces, mechanism, label, noise)
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
     label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
-    fit: tuple[HasBlocks, Noise] = surfaces, noise
+    fit: tuple[Data, Mechanism, Noise, Tensor] = surfaces, mechanism, noise, torch.zeros_like(mechanism.axes)
     if sparse:
-        fused, mechanism = compared_with_each_other(scans, surfaces, mechanism, label, frames)
+        fit = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label, reference)
+        mechanism = fit[1].without_frame(reference)
         motions = mechanism.motions()
-        fit = fused, fused.noise(motions)
     loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
     found = _described(mechanism, points, link, frames, residuals, loose)
-    axis, origin = axis_stds(fit[0], mechanism, label, fit[1], found.origins())
-    return replace(found, axis_std=axis[1:], origin_std=origin[1:])
+    axis, origin = axis_stds(*fit, label, found.origins())
+    shown = _shown(surfaces, mechanism, label)[1:]
+    return replace(found, axis_std=axis[1:].where(shown, torch.inf), origin_std=origin[1:].where(shown, torch.inf))
 
 
 def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
     """Return motions (T, K, 4, 4) and labels (n,), those of links found one after another where parts do not fit."""
     motions = surfaces.refined(motions, label, [scale * surfaces.spacing for scale in GROWTH.others])
-    costs = Growth(surfaces, motions, label).costs(motions).gather(1, label.unsqueeze(1))
-    if float((costs < GROWTH.explained).double().mean()) > GROWTH.registered:
-        return motions, label
-    found, new = grown(surfaces, motions)
-    return torch.cat([motions, found], 1), new + motions.shape[1]
+    state = Growth(surfaces, motions, label).labeled()
+    if float((state.label >= 0).double().mean()) < GROWTH.registered:
+        state = Growth.rooted(surfaces, motions)
+    return grown(state)
 
 
 def compared_with_each_other(
-    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor, frames: Tensor
-) -> tuple[FusedScans, Mechanism]:
+    scans: Sequence[Target], surfaces: Surfaces, mechanism: Mechanism, label: Tensor, reference: int
+) -> tuple[FusedScans, Mechanism, Noise, Tensor]:
     """Return all scans on the links (n,) of samples, and the mechanism fitted to what each scan shows with the others.
 
-    ``frames``: numbers of the mechanism's frames among the T scans; the one left out is the reference.
+    With them come the noise, and the last steps (K, 6) of the axes. The reference is a frame as any other, but stays.
     """
-    (reference,) = set(range(len(scans))) - set(frames.tolist())
-    motions = torch.eye(4, dtype=torch.float64).repeat(len(scans), len(mechanism.parents), 1, 1)
     for _ in range(MODEL.fusions):
-        motions[frames] = mechanism.motions()
-        moved = surfaces.moved(motions[:, label])[0]
-        fused = FusedScans.of(scans, moved, label, motions, surfaces.size, reference)
-        sigma = fused.noise(motions[frames]).sigma
-        mechanism = fitted(fused, mechanism, label, [scale * sigma for scale in MODEL.kernels])
-    return fused, mechanism
+        before, motions = mechanism, mechanism.motions()
+        fused = FusedScans.of(scans, surfaces, label, motions, reference)
+        noise = fused.noise(motions)
+        mechanism = fitted(fused, before, label, [scale * noise.sigma for scale in MODEL.kernels])
+        old, new = (surfaces.moved(own[:, label])[0] for own in (motions, mechanism.motions()))
+        if float((new - old).norm(dim=-1).mean()) < MODEL.still * noise.sigma:
+            break
+    return fused, mechanism, noise, mechanism.steps_from(before)
 
 
 def without_welds(
@@ -198,9 +201,13 @@ def without_welds(
 
 
 def assembled(
-    surfaces: Surfaces, motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate]
+    surfaces: Surfaces, motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate], noise: Noise
 ) -> tuple[Mechanism, Tensor]:
-    """Return the tree of the joints of most evidence, and the labels by its links."""
+    """Return the tree of the joints of most evidence, and the labels by its links.
+
+    The ground is a link too: where the data speak for it, the root stands still, or hangs on a base that does. A round
+    base shows by that alone that what stands on it turns.
+    """
     count, frames = motions.shape[1], len(motions)
     pairs = torch.tensor(list(joints), dtype=torch.long).reshape(-1, 2)
     lengths = torch.tensor([joint.length for joint in joints.values()], dtype=torch.float64)
@@ -208,20 +215,47 @@ def assembled(
     parents, order = rooted(chosen, surfaces.travel(motions, label).argmin().reshape(1), count)
     place = torch.zeros_like(order)
     above, axes, values = [-1], [torch.zeros(6).double()], [torch.zeros(frames).double()]
+
+    def hang(parent: int, joint: Candidate, sign: int) -> int:
+        # Seen from the other link, joints in a row come in reverse. Between two of them is a link without samples.
+        for twist, value in list(zip(joint.twists, joint.values.mT, strict=True))[::sign]:
+            above.append(parent)
+            axes.append(twist)
+            values.append(sign * value)
+            parent = len(above) - 1
+        return parent
+
+    blocks = surfaces.blocks(motions, label, NUMBERS.cut * noise.sigma)
+    ground = best_joint(from_ground(motions, blocks, order[0], noise, surfaces.size))
+    held = ground.length < 0
+    if held and ground.kind != "fixed":
+        place[order[0]] = hang(0, ground, 1)
     for link in order[1:].tolist():
         parent = int(parents[link])
         joint = joints[min(link, parent), max(link, parent)]
-        # Seen from the other link, joints in a row come in reverse. Between two of them is a link without samples.
-        row = list(zip(joint.twists, joint.values.mT, strict=True))
-        for number, (twist, value) in enumerate(row if parent < link else row[::-1]):
-            above.append(len(above) - 1 if number else int(place[parent]))
-            axes.append(twist)
-            values.append(value if parent < link else -value)
-        place[link] = len(above) - 1
+        place[link] = hang(int(place[parent]), joint, 1 if parent < link else -1)
+    base = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1) if held else motions[:, order[0]]
     mechanism = Mechanism(
-        parents=tuple(above), axes=torch.stack(axes), base=motions[:, order[0]], values=torch.stack(values, 1)
+        parents=tuple(above), axes=torch.stack(axes), base=base, values=torch.stack(values, 1), held=held
     )
     return mechanism, place[label]
+
+
+def _shown(surfaces: Surfaces, mechanism: Mechanism, label: Tensor) -> Tensor:
+    """Return for each link whether the scans show it and its parent where the joints put them.
+
+    Standard deviations hold for links that are right; one that most scans do not show there is not.
+    """
+    motions, parents = mechanism.motions(), mechanism.parents
+    costs = Growth(surfaces, motions, label).costs(motions).gather(1, label.unsqueeze(1))[:, 0]
+    count = torch.bincount(label, minlength=len(parents))
+    shares = torch.zeros(len(parents)).double().index_add(0, label, (costs > GROWTH.explained).double()) / count
+    # A link without samples is as right as the next.
+    own = [bool(share <= 0.5) for share in shares]
+    for link in reversed(range(1, len(parents))):
+        if not count[parents[link]]:
+            own[parents[link]] = own[link]
+    return torch.tensor([own[link] and own[max(parent, 0)] for link, parent in enumerate(parents)])
 
 
 def _loose(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> tuple[bool, ...]:

@@ -14,6 +14,7 @@ from torchreg.geometry.rigid import rigid_matrix, se3_exp, se3_log
 from torchreg.geometry.rotation import skew, spread_rotations
 from torchreg.geometry.sampling import even_order
 from torchreg.registration.blend import turn_about
+from torchreg.registration.robots.joints import JOINTS
 from torchreg.solvers.robust import geman_mcclure_weight
 
 
@@ -26,7 +27,6 @@ class PieceNumbers:
     kept: int = 12  # best rotations of a scan, which are refined
     axes: int = 4  # of these, whose axes are tried as hinges of all scans
     turns: int = 36  # values of a hinge that are tried
-    turned: float = 0.15  # radians from which a motion has an axis
     coarse: float = 0.25  # of the radius: kernel of the first comparison
     wide: tuple[float, ...] = (0.3, 0.3, 0.2, 0.2, 0.15, 0.1, 0.1, 0.07, 0.05, 0.05)  # kernels of the refinement
     fine: float = 2.5  # distances between points: kernel of the last comparison
@@ -183,7 +183,7 @@ def rotations_and_hinge(piece: Piece) -> list[Tensor]:
     motions = _best(motions, piece.costs(motions, PIECES.fine * piece.spacing), PIECES.axes)
     twists = se3_log(motions.double()).reshape(-1, 6)
     angle = twists[:, 3:].norm(dim=-1, keepdim=True)
-    twists = (twists / angle)[angle[:, 0] > PIECES.turned]
+    twists = (twists / angle)[angle[:, 0] > JOINTS.turned]
     if len(twists) == 0:
         return [motions[:, 0]]
     point = torch.linalg.cross(twists[:, 3:], twists[:, :3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,19 +32,25 @@ NUMBERS = SurfaceNumbers()
 
 
 class Target:
-    """A scan to be compared with."""
+    """A scan to be compared with; where normals are estimates, whole links may have the other sign: it is not used."""
 
-    def __init__(self, points: Tensor, normals: Tensor) -> None:
-        self.points, self.normals = points, normals
+    def __init__(self, points: Tensor, normals: Tensor, *, signed: bool = True) -> None:
+        self.points, self.normals, self.signed = points, normals, signed
         self.spacing = sampling_distance(points)
         self.tree = NeighborTree(points)
+
+    def facing(self, normals: Tensor) -> Target:
+        """Return the scan with other normals, whose signs are known."""
+        found = copy.copy(self)
+        found.normals, found.signed = normals, True
+        return found
 
     def residuals(self, moved: Tensor, normals: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return signed distances (..., K) of moved points from this scan's planes, its normals, and squared distances.
 
         The squared distances (..., K) are across the planes and, beyond the spacing of the scan's points, along them;
-        those of points whose normals (..., K, 3) face the other way, or that no point of the scan is within reach of,
-        are infinite.
+        those of points whose normals (..., K, 3) face the other way, if signs are known, or that no point of the scan
+        is within reach of, are infinite.
         """
         found, distance = self.tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
         index = found.reshape(moved.shape[:-1])
@@ -52,7 +59,9 @@ class Target:
         across = (offset * facing).sum(-1)
         along = (offset.square().sum(-1) - across.square()).clamp_min(0).sqrt()
         square = across.square() + (along - self.spacing).clamp_min(0).square()
-        return across, facing, torch.where(near & ((facing * normals).sum(-1) > 0), square, torch.inf)
+        if self.signed:
+            near &= (facing * normals).sum(-1) > 0
+        return across, facing, torch.where(near, square, torch.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +85,15 @@ class Blocks:
     def of(cls, sums: Tensor, centers: Tensor) -> Blocks:
         """Return the equations of the sums (T, K, 43) of `frame_sums` in T frames about the centers (T, K, 3)."""
         return cls(sums[..., :36].unflatten(-1, (6, 6)), sums[..., 36:42], centers, sums[..., 42])
+
+    def joined(self, owner: Tensor, centers: Tensor) -> Blocks:
+        """Return the equations of links (K,), about their centers, whose pieces' these are: piece p is of owner[p]."""
+
+        def added(values: Tensor) -> Tensor:
+            size = (len(values), centers.shape[1], *values.shape[2:])
+            return values.new_zeros(size).index_add(1, owner, values)
+
+        return Blocks(added(self.hessian), added(self.gradient), centers, added(self.count))
 
 
 def frame_sums(arms: Tensor, facing: Tensor, across: Tensor, square: Tensor, label: Tensor, size: int) -> Tensor:
@@ -101,6 +119,7 @@ class Surfaces:
     patch: Tensor  # (n,) patch of each sample
     targets: tuple[Target, ...]  # T scans
     size: float  # diagonal of the samples
+    reference: None = None  # no frame: the samples stay
 
     @classmethod
     def of(cls, samples: Tensor, normals: Tensor, targets: Sequence[Target]) -> Surfaces:
@@ -151,25 +170,38 @@ class Surfaces:
 
     def _repeats(self, across: Tensor, inlier: Tensor, label: Tensor) -> float:
         """Return the growth of the variance of means over patches, beyond that of independent residuals (T, n)."""
-        key = (self.patch * (int(label.max()) + 1) + label).unique(return_inverse=True)[1]
+        key = self.pieces(label)[0]
         blank = across.new_zeros(len(across), int(key.max()) + 1)
         count = blank.index_add(1, key, inlier.to(across))
         sums = blank.index_add(1, key, across)
         variance = across.square().sum() / inlier.sum().clamp_min(1)
         return max(1.0, float(sums.square().sum() / (variance * count.sum()).clamp_min(1e-300)))
 
+    def pieces(self, label: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the piece (n,) of each sample, what a link has of a patch, and the link (P,) of each piece."""
+        count = int(label.max()) + 1
+        key, piece = (self.patch * count + label).unique(return_inverse=True)
+        return piece, key % count
+
     def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
         """Return the normal equations of robust squared residuals at the motions (T, K, 4, 4) of parts (n,)."""
-        size = motions.shape[1]
-        member = torch.nn.functional.one_hot(label, size).to(self.samples)
+        return self._summed(motions, label, scale, label, torch.arange(motions.shape[1]))
+
+    def piecewise(self, motions: Tensor, label: Tensor, scale: float) -> tuple[Blocks, Tensor]:
+        """Return the normal equations of pieces of links, about the links' centers, and the link (P,) of each."""
+        piece, owner = self.pieces(label)
+        return self._summed(motions, label, scale, piece, owner), owner
+
+    def _summed(self, motions: Tensor, label: Tensor, scale: float, piece: Tensor, owner: Tensor) -> Blocks:
+        member = torch.nn.functional.one_hot(label, motions.shape[1]).to(self.samples)
         middle = (member.mT @ self.samples) / member.sum(0).clamp_min(1).unsqueeze(-1)
         centers = (motions[..., :3, :3] @ middle.unsqueeze(-1)).squeeze(-1) + motions[..., :3, 3]
         rows = []
         for target, frame, center in zip(self.targets, motions, centers, strict=True):
             points, normals = self.moved(frame[label])
             across, facing, square = target.residuals(points, normals, NUMBERS.reach * scale)
-            rows.append(frame_sums(points - center[label], facing, across, square / scale**2, label, size))
-        return Blocks.of(torch.stack(rows), centers)
+            rows.append(frame_sums(points - center[label], facing, across, square / scale**2, piece, len(owner)))
+        return Blocks.of(torch.stack(rows), centers[:, owner])
 
     def cost(self, motions: Tensor, label: Tensor, scale: float) -> Tensor:
         """Return the robust costs (T, K) of the parts' squared residuals, in squared scales."""
