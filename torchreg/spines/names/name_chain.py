@@ -54,7 +54,7 @@ def name_over_time(
     # Without features a mirror changes nothing: of the last start this is the first round.
     by_motion = _Round(frames, reference, names, model.starting(*SEARCH.starts[-1]), unknown)
     # What names do not determine, as motion where no two frames share a tip, is that of the first start.
-    model = model.mirrored(frames, by_motion.labels).starting(*SEARCH.starts[0])
+    model = model.mirrored(frames, by_motion.labels, reference).starting(*SEARCH.starts[0])
     found = {len(SEARCH.starts) - 1: by_motion}
     jobs = (
         Job(

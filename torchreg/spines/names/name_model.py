@@ -91,17 +91,18 @@ class NameModel:
         """Return the model with one scale of displacements, and a weight of features."""
         return replace(self, displacement=torch.full_like(self.displacement, displacement), weight=weight)
 
-    def mirrored(self, frames: Sequence[TipObservations], names: Tensor) -> NameModel:
-        """Return the model of a symmetric body, if frames show that it is one; itself if not."""
+    def mirrored(self, frames: Sequence[TipObservations], names: Tensor, reference: int) -> NameModel:
+        """Return the model of a symmetric body, if frames with names (T, K) show one; else itself."""
         mirror = find_mirror(self.features, self.background, frames, names)
         if mirror is None:
             return self
         levels = mirror.levels.clamp_max(SHRINKAGE.variance)
         covariances = [level * c for level, c in zip(levels.tolist(), self.background.covariances, strict=True)]
+        known = names[reference][None]
         return replace(
             self,
             mirror=mirror,
-            mean=(self.mean + mirror(self.mean)) / 2,
+            mean=(self.mean + mirror.features(self.features, frames[reference], known, self.median_distances)[0]) / 2,
             density=GroupedDensity(self.features.groups, covariances),
         )
 
@@ -165,8 +166,10 @@ class NameModel:
         median = distances.nanmedian(0).values
         median = torch.where(median.isnan(), self.median_distances, median)
         samples = torch.cat([self.features(frame, row, median) for frame, row in zip(frames, maps, strict=True)])
-        mirrored = samples if self.mirror is None else torch.cat((samples, self.mirror(samples)))
-        mean, density = fit_groups(mirrored, self.background)
+        images = [] if self.mirror is None else [
+            self.mirror.features(self.features, *row, median) for row in zip(frames, maps, strict=True)
+        ]  # fmt: skip
+        mean, density = fit_groups(torch.cat((samples, *images)), self.background)
         return replace(
             self,
             mean=mean,

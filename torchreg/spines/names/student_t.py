@@ -30,10 +30,11 @@ def t_log_density(squares: Tensor, scale: Tensor, size: int, dof: float = TAILS.
 
 @dataclass(frozen=True, eq=False)
 class FeatureGroup:
-    """Features whose errors go together, columns ``index`` (n,), and the rank of their space, at most n."""
+    """Features whose errors go together, columns ``index`` (n,), the rank of their space, at most n, and their kind."""
 
     index: Tensor
     rank: int
+    number: int = 0
 
 
 class GroupedDensity:
