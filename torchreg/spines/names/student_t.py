@@ -70,7 +70,7 @@ class Shrinkage:
     """How much a covariance of few samples leans on the one that is known beforehand."""
 
     samples: float = 2.0  # that the known one counts for, and one more for each dimension
-    variance: float = 0.25  # known beforehand, in those of the background
+    variance: float = 0.1  # known beforehand, in those of the background
 
 
 SHRINKAGE = Shrinkage()

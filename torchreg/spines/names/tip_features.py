@@ -100,8 +100,8 @@ class TipFeatures:
         sizes = (num_names, count, len(self.triples), num_names * num_limb_features)
         ranks = (min(num_names, count), max(count - num_names, 0), len(self.triples), num_names * num_limb_features)
         columns = torch.arange(sum(sizes)).split(sizes)
-        rows = enumerate(zip(columns, ranks, strict=True))
-        self.groups = [FeatureGroup(index, rank, number) for number, (index, rank) in rows if rank]
+        kinds = zip(columns, ranks, range(len(sizes)), strict=True)
+        self.groups = [FeatureGroup(index, rank, number) for index, rank, number in kinds if rank]
 
     def distances(self, frame: TipObservations, maps: Tensor) -> Tensor:
         """Return the distances (P, K (K - 1) / 2) between named tips, NaN where one is missing."""
