@@ -142,18 +142,27 @@ def test_legs_keep_their_names_in_any_order_of_tips(body, lift, reference):
         assert bool((found.confidence > 0.5).all())
 
 
-def test_a_mirror_gives_the_features_of_the_mirrored_frame_under_exchanged_names():
-    distances, volumes = random(5, 5).abs(), random(5, 5, 5, seed=1)
+def test_a_mirror_image_has_opposite_volumes_and_differs_in_as_many_dimensions_as_features_can():
+    volumes, distances, zeros = random(5, 5, 5, seed=1), random(5, 5).abs(), torch.zeros(10).double()
     signs = {order: (-1) ** (sum(a > b for a, b in combinations(order, 2))) for order in permutations(range(3))}
     odd = sum(sign * volumes.permute(*order) for order, sign in signs.items())
-    frame, mirrored = (
-        TipObservations(random(5, 8, 3), distances + distances.mT, sign * odd, random(5, 3)) for sign in (1, -1)
-    )
+    frame = TipObservations(random(5, 8, 3), distances + distances.mT, odd, random(5, 3))
     kinds, names = TipFeatures(5, 3, with_volumes=True), torch.tensor([[1, 0, 3, 2, 4]])
-    columns, signs = body_mirror._images(kinds, names)
-    usual = torch.zeros(10).double()
-    features = kinds(frame, torch.arange(5)[None], usual)[0]
-    torch.testing.assert_close(signs[0] * features[columns[0]], kinds(mirrored, names, usual)[0])
+
+    def image(rows):
+        """The mirrored features, linear in the measurements of a frame."""
+        own, mirrored = kinds(rows, torch.arange(5)[None], zeros)[0], kinds(rows.mirrored(), names, zeros)[0]
+        return own - mirrored
+
+    columns = []
+    for number in range(200):
+        distances, volumes = random(5, 5, seed=number), random(5, 5, 5, seed=number)
+        odd = sum(sign * volumes.permute(*order) for order, sign in signs.items())
+        columns.append(image(TipObservations(frame.curves, distances + distances.mT, odd, random(5, 3, seed=number))))
+    offsets = torch.stack(columns)
+    ranks = [int(torch.linalg.matrix_rank(offsets[:, group.index], rtol=1e-6)) for group in kinds.groups]
+    background = name_model._background(kinds, [frame])[1]
+    assert body_mirror._sizes(kinds, background, names)[0].tolist() == ranks
 
 
 def test_the_mirror_of_a_body_is_found_and_limbs_that_are_all_alike_have_none():

@@ -54,7 +54,7 @@ def name_over_time(
     # Without features a mirror changes nothing: of the last start this is the first round.
     by_motion = _Round(frames, reference, names, model.starting(*SEARCH.starts[-1]), unknown)
     # What names do not determine, as motion where no two frames share a tip, is that of the first start.
-    model = model.mirrored(frames, by_motion.labels).starting(*SEARCH.starts[0])
+    model = model.mirrored(frames, by_motion.labels, reference).starting(*SEARCH.starts[0])
     found = {len(SEARCH.starts) - 1: by_motion}
     jobs = (
         Job(
@@ -116,18 +116,19 @@ class _Round:
 
     def _neighborhood(self, near: int, number: int, known: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
         """Return names (P, K) of a frame within two exchanges of the seeds, and the most probable ones (K,)."""
-        frame, maps = self.frames[number], seeds
-        before = self.model.of_names(self.frames[near], known[None])
+        maps = seeds
         for kept in (SEARCH.num_kept, SEARCH.num_candidates // 2):
-            maps = _exchanged(maps, len(frame))
-            features = self.model.of_names(frame, maps)
-            missing = _missing(maps)
-            by_itself = self.model.first_scores(features) + missing
-            after = self.model.next_scores(before, features)[0] + missing
-            after = after + self._motion(near, number, known[None], maps)[0]
+            maps = _exchanged(maps, len(self.frames[number]))
+            by_itself = self._by_itself(number, maps)
+            after = by_itself + self._motion(near, number, known[None], maps)[0]
             ranks = [scores.argsort(descending=True, stable=True)[:kept] for scores in (after, by_itself)]
             first, maps = maps[ranks[0][0]], maps[torch.cat(ranks).unique()]
         return torch.cat((maps, seeds)).unique(dim=0), first
+
+    def _by_itself(self, number: int, maps: Tensor) -> Tensor:
+        """Return the scores (P,) of names (P, K) of a frame without any other."""
+        scores = self.model.scores(self.model.of_names(self.frames[number], maps))
+        return scores + PRIORS.missing * (maps < 0).sum(-1).double()
 
     def _motion(self, near: int, number: int, known: Tensor, maps: Tensor) -> Tensor:
         """Return the scores (A, B) of the motion between names (A, K) of a frame and names (B, K) of another."""
@@ -140,12 +141,10 @@ class _Round:
 
     def _most_probable(self, candidates: Sequence[Tensor]) -> Tensor:
         """Return the most probable names (T, K) among candidates; keep their score and confidence."""
-        features = [self.model.of_names(*row) for row in zip(self.frames, candidates, strict=True)]
-        start = self.model.first_scores(features[0]) + _missing(candidates[0])
+        start = self._by_itself(0, candidates[0])
         steps = [
-            self.model.next_scores(features[number - 1], features[number])
-            + self._motion(number - 1, number, candidates[number - 1], candidates[number])
-            + _missing(candidates[number])
+            self._motion(number - 1, number, candidates[number - 1], candidates[number])
+            + self._by_itself(number, candidates[number])
             for number in range(1, len(candidates))
         ]
         path, self.score = _best_path(start, steps)
@@ -156,11 +155,6 @@ class _Round:
             [(same * chance[:, None]).sum(0) for same, chance in zip(alike, chances, strict=True)]
         )
         return labels
-
-
-def _missing(maps: Tensor) -> Tensor:
-    """Return the prior scores (P,) of the tips that names (P, K) lack."""
-    return PRIORS.missing * (maps < 0).sum(-1).double()
 
 
 def _exchanged(maps: Tensor, num_tips: int) -> Tensor:

@@ -24,8 +24,6 @@ class NamingPriors:
     independent_points: float = 2.0  # of a limb: the others move with these
     turn: float = 0.1  # mean of 1 - cos of the body's rotation between two frames, at first: about 26 degrees
     turn_samples: float = 2.0  # rotations that this counts for when it is learned
-    correlation: float = 0.8  # of features between frames, at first: errors come from poses, which last
-    max_correlation: float = 0.95
     min_displacement: float = 0.01  # scale of displacements that is never undercut: nodes are no nearer to each other
     noise: float = 1e-3  # of features, below which no difference counts
     background_maps: int = 40  # random names per frame that show what features look like if names are wrong
@@ -46,9 +44,9 @@ def relative_maps(before: Tensor, after: Tensor, num_tips: int) -> Tensor:
 class NameModel:
     """The probability of all frames' names: a chain.
 
-    A frame's features are those of the frame before, and as far as they do not correlate, those of a mean frame; both
-    up to multivariate t-distributed errors. The points of each limb stay, or move rigidly with the whole body, up to
-    t-distributed displacements. Tips without a name, and features and positions under wrong names, are background.
+    A frame's features are those of a mean frame up to multivariate t-distributed errors. The points of each limb stay,
+    or move rigidly with the whole body, up to t-distributed displacements from the frame before. Tips without a name,
+    and features and positions under wrong names, are background.
     """
 
     features: TipFeatures  # that are compared
@@ -56,7 +54,6 @@ class NameModel:
     density: GroupedDensity  # of their errors
     background_mean: Tensor  # (n,) under random names
     background: GroupedDensity  # density of features under random names
-    correlation: Tensor  # (G,) of errors between two frames, of each group of features
     median_distances: Tensor  # (K (K - 1) / 2,) median distances between named tips
     displacement: Tensor  # (S,) scale of the displacements of a limb's points
     turn: float  # mean of 1 - cos of the body's rotation between two frames
@@ -80,7 +77,6 @@ class NameModel:
             density=GroupedDensity(features.groups, [SHRINKAGE.variance * c for c in background.covariances]),
             background_mean=center,
             background=background,
-            correlation=torch.full((len(features.groups),), PRIORS.correlation, dtype=torch.float64),
             median_distances=median,
             displacement=torch.zeros(SAMPLING.num_points, dtype=torch.float64),
             turn=PRIORS.turn,
@@ -91,17 +87,18 @@ class NameModel:
         """Return the model with one scale of displacements, and a weight of features."""
         return replace(self, displacement=torch.full_like(self.displacement, displacement), weight=weight)
 
-    def mirrored(self, frames: Sequence[TipObservations], names: Tensor) -> NameModel:
-        """Return the model of a symmetric body, if frames show that it is one; itself if not."""
+    def mirrored(self, frames: Sequence[TipObservations], names: Tensor, reference: int) -> NameModel:
+        """Return the model of a symmetric body, if frames with names (T, K) show one; else itself."""
         mirror = find_mirror(self.features, self.background, frames, names)
         if mirror is None:
             return self
         levels = mirror.levels.clamp_max(SHRINKAGE.variance)
         covariances = [level * c for level, c in zip(levels.tolist(), self.background.covariances, strict=True)]
+        known = names[reference][None]
         return replace(
             self,
             mirror=mirror,
-            mean=(self.mean + mirror(self.mean)) / 2,
+            mean=(self.mean + mirror.features(self.features, frames[reference], known, self.median_distances)[0]) / 2,
             density=GroupedDensity(self.features.groups, covariances),
         )
 
@@ -109,29 +106,11 @@ class NameModel:
         """Return the features (P, n) of a frame under mappings (P, K)."""
         return self.features(frame, maps, self.median_distances)
 
-    def first_scores(self, features: Tensor) -> Tensor:
-        """Return the log-probability ratios (P,) of features (P, n) of a frame by itself to the background."""
+    def scores(self, features: Tensor) -> Tensor:
+        """Return the log-probability ratios (P,) of features (P, n) of a frame to the background."""
         if self.weight == 0:
             return features.new_zeros(len(features))
         scores = self.density(features - self.mean) - self._background_scores(features)
-        return self.weight * scores.sum(-1)
-
-    def next_scores(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return those (A, B) of features (B, n) after a frame with features (A, n)."""
-        if self.weight == 0:
-            return after.new_zeros(len(before), len(after))
-        correlation = torch.zeros_like(self.mean)
-        for group, value in zip(self.features.groups, self.correlation, strict=True):
-            correlation[group.index] = value
-        errors = before - self.mean
-        share = torch.where(errors.isnan(), 0.0, correlation)
-        innovation = (1 - share.square()).sqrt().unsqueeze(1)
-        residuals = (after - self.mean - (share * errors.nan_to_num()).unsqueeze(1)) / innovation
-        known = (~(after - self.mean).isnan()).to(after)
-        log_innovation = torch.stack(
-            [(known[:, g.index] * innovation[..., g.index].log()).mean(-1) * g.rank for g in self.features.groups], -1
-        )
-        scores = self.density(residuals) - log_innovation - self._background_scores(after)
         return self.weight * scores.sum(-1)
 
     def _background_scores(self, features: Tensor) -> Tensor:
@@ -165,13 +144,14 @@ class NameModel:
         median = distances.nanmedian(0).values
         median = torch.where(median.isnan(), self.median_distances, median)
         samples = torch.cat([self.features(frame, row, median) for frame, row in zip(frames, maps, strict=True)])
-        mirrored = samples if self.mirror is None else torch.cat((samples, self.mirror(samples)))
-        mean, density = fit_groups(mirrored, self.background)
+        images = [] if self.mirror is None else [
+            self.mirror.features(self.features, *row, median) for row in zip(frames, maps, strict=True)
+        ]  # fmt: skip
+        mean, density = fit_groups(torch.cat((samples, *images)), self.background)
         return replace(
             self,
             mean=mean,
             density=density,
-            correlation=_correlations(density.whitened(samples - mean)),
             median_distances=median,
             weight=1.0,
             **self._motion(frames, names),
@@ -221,14 +201,3 @@ def _background(features: TipFeatures, frames: Sequence[TipObservations]) -> tup
         level = values[-group.rank :].mean() + PRIORS.noise**2
         covariances.append(level * vectors[:, -group.rank :] @ vectors[:, -group.rank :].mT)
     return center, GroupedDensity(features.groups, covariances)
-
-
-def _correlations(whitened: Sequence[Tensor]) -> Tensor:
-    """Return the correlations (G,) between frames of whitened errors (T, rank); far ones count as unit vectors."""
-    rows = []
-    for errors in whitened:
-        errors = errors / (1 + errors.square().mean(-1, keepdim=True)).sqrt()
-        before, after = errors[:-1], errors[1:]
-        size = (before.square().sum() + after.square().sum()) / 2
-        rows.append((before * after).sum() / size.clamp_min(1e-12))
-    return torch.stack(rows).clamp(0, PRIORS.max_correlation)

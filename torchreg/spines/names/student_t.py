@@ -30,10 +30,11 @@ def t_log_density(squares: Tensor, scale: Tensor, size: int, dof: float = TAILS.
 
 @dataclass(frozen=True, eq=False)
 class FeatureGroup:
-    """Features whose errors go together, columns ``index`` (n,), and the rank of their space, at most n."""
+    """Features whose errors go together, columns ``index`` (n,), the rank of their space, at most n, and their kind."""
 
     index: Tensor
     rank: int
+    number: int = 0
 
 
 class GroupedDensity:
@@ -69,7 +70,7 @@ class Shrinkage:
     """How much a covariance of few samples leans on the one that is known beforehand."""
 
     samples: float = 2.0  # that the known one counts for, and one more for each dimension
-    variance: float = 0.25  # known beforehand, in those of the background
+    variance: float = 0.1  # known beforehand, in those of the background
 
 
 SHRINKAGE = Shrinkage()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import torch
@@ -40,6 +40,10 @@ class TipObservations:
 
     def __len__(self) -> int:
         return len(self.curves)
+
+    def mirrored(self) -> TipObservations:
+        """Return the relations of the mirror image, not the curves."""
+        return replace(self, volumes=-self.volumes)
 
 
 def observe_tips(skeletons: Sequence[Skeleton], relations: Sequence[TipRelations]) -> list[TipObservations]:
@@ -96,7 +100,8 @@ class TipFeatures:
         sizes = (num_names, count, len(self.triples), num_names * num_limb_features)
         ranks = (min(num_names, count), max(count - num_names, 0), len(self.triples), num_names * num_limb_features)
         columns = torch.arange(sum(sizes)).split(sizes)
-        self.groups = [FeatureGroup(index, rank) for index, rank in zip(columns, ranks, strict=True) if rank]
+        kinds = zip(columns, ranks, range(len(sizes)), strict=True)
+        self.groups = [FeatureGroup(index, rank, number) for index, rank, number in kinds if rank]
 
     def distances(self, frame: TipObservations, maps: Tensor) -> Tensor:
         """Return the distances (P, K (K - 1) / 2) between named tips, NaN where one is missing."""
