@@ -53,6 +53,7 @@ OWNERS = {
     "OpenEXR": {"io"},
     "trimesh": {"io", "viz"},
     "pygltflib": {"io", "viz"},
+    "yaml": {"io"},
     "safetensors": {"io"},
     "matplotlib": {"viz"},
     "viser": {"viz"},
@@ -68,6 +69,7 @@ DOORS = re.compile(r"`(\w+)`")
 LAZY = {"matplotlib", "viser", "websockets", "plotly", "cv2", "PIL", "OpenEXR", "rerun"}
 LOWEST_THIRD_PARTY = {"errors": set(), "metrics": {"torch"}, "_checks": {"torch"}, "_threads": {"torch"}}
 IMPORT_NAMES = {
+    "pyyaml": "yaml",
     "pytorch-kinematics": "pytorch_kinematics",
     "scikit-image": "skimage",
     "pillow": "PIL",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
@@ -25,7 +25,6 @@ from torchreg.io.file_format import plain_text
 from torchreg.io.limits import FileLimits, local_path
 
 _KEY = re.compile(r"^([A-Za-z_][\w.]*):[ \t]*(.*)$", re.MULTILINE)
-_FIELD = re.compile(r"^[ \t]+(rows|cols|dt|data):[ \t]*", re.MULTILINE)
 # Names of the same entries in calibrations of different origin.
 _SINGLE = (
     ("camera_matrix", "distortion_coefficients"), ("camera_matrix", "dist_coeffs"), ("cameraMatrix", "distCoeffs"),
@@ -36,7 +35,6 @@ PAIRS = (
     ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
     ("K1", "D1", "K2", "D2"),
 )
-_DEEPEST = 3  # objects within each other
 _WIDTHS, _HEIGHTS, _SIZES = ("image_width", "width"), ("image_height", "height"), ("image_size", "imageSize", "size")
 
 Values = dict[str, "Tensor | str | Values"]
@@ -154,35 +152,44 @@ def _written(name: str, matrix: Tensor) -> str:
     return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {data} ]"
 
 
-def _parsed(text: str, path: Path, depth: int = 0) -> Values:
+class _Loader(yaml.BaseLoader):
+    """Reads words, lists and mappings, as no number of YAML 1.1 is one of FileStorage; no entry is used twice."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases are not supported")
+        return super().compose_node(parent, index)
+
+
+def _parsed(text: str, path: Path) -> Values:
     """Return the matrices, lists of numbers, other words and what is nested in a file by their names."""
-    marks = list(_KEY.finditer(text))
-    ends = [*(mark.start() for mark in marks[1:]), len(text)][: len(marks)]
+    try:
+        # FileStorage's first line is not valid YAML; anything after the first document is not a camera's.
+        document = next(yaml.load_all(re.sub(r"\A%YAML.*", "", text), _Loader), None)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise FormatError(f"{path}: is cut off or no YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(document, dict):
+        raise FormatError(f"{path}: must hold `name: value` lines")
+    return _values(document, str(path))
+
+
+def _values(document: Mapping[Any, Any], where: str) -> Values:
     values: Values = {}
-    for mark, end in zip(marks, ends, strict=True):
-        name, first = mark.group(1), re.sub(r"(^|\s)#.*", "", mark.group(2)).strip()
-        body = text[mark.start(2) : end]
-        inner = textwrap.dedent(text[mark.end() + 1 : end]) if not first else ""
-        if "opencv-matrix" in first or (not first and re.search(r"^[ \t]+data:", body, re.MULTILINE)):
-            values[name] = _matrix(body, f"{path}: {name}")
-        elif first.startswith("[") or (not first and re.match(r"\s*-\s", body)):
-            values[name] = _squared(_listed(body, f"{path}: {name}"))
-        elif depth < _DEEPEST and _KEY.search(inner):
-            values[name] = _parsed(inner, path, depth + 1)
+    for name, value in document.items():
+        if isinstance(value, dict):
+            values[name] = (
+                _matrix(value, f"{where}: {name}") if {"data", "rows"} & value.keys() else _values(value, where)
+            )
+        elif isinstance(value, list):
+            numbers = _listed(value, f"{where}: {name}")
+            values[name] = numbers.reshape(3, 3) if numbers.numel() == 9 else numbers
         else:
-            values[name] = first.strip("\"'")
+            values[name] = str(value)
     return values
 
 
-def _squared(values: Tensor) -> Tensor:
-    return values.reshape(3, 3) if values.numel() == 9 else values
-
-
-def _matrix(body: str, where: str) -> Tensor:
-    marks = list(_FIELD.finditer(body))
-    ends = [*(mark.start() for mark in marks[1:]), len(body)][: len(marks)]
-    fields = {mark.group(1): body[mark.end() : end] for mark, end in zip(marks, ends, strict=True)}
-    rows, columns = (fields.get(side, "").strip() for side in ("rows", "cols"))
+def _matrix(fields: Mapping[str, Any], where: str) -> Tensor:
+    rows, columns = (str(fields.get(side, "")) for side in ("rows", "cols"))
     if not _is_count(rows) or not _is_count(columns) or "data" not in fields:
         raise FormatError(f"{where} lacks rows, cols or data: the file is cut off or damaged")
     data = _listed(fields["data"], where)
@@ -196,34 +203,20 @@ def _is_count(word: str) -> bool:
     return word.isascii() and word.isdecimal() and len(word) < 10
 
 
-def _listed(body: str, where: str) -> Tensor:
-    """Return the numbers of a list in brackets, which may hold lists, or of one with a hyphen before each entry."""
-    inner = body.strip()
-    if inner.startswith("["):
-        opened = [inner[:k].count("[") - inner[:k].count("]") for k in _after_brackets(inner)]
-        if 0 not in opened:
-            raise FormatError(f"{where} has no closing bracket: the file is cut off")
-        inner = inner[: _after_brackets(inner)[opened.index(0)]]
-    elif re.match(r"-\s", inner):
-        inner = re.sub(r"^\s*(-\s+)+", " ", inner, flags=re.MULTILINE).partition("---")[0]
-    else:
-        raise FormatError(f"{where} has no closing bracket: the file is cut off")
-    words = [word for word in re.split(r"[\[\],\s]+", inner) if word]
+def _listed(entries: Any, where: str) -> Tensor:
+    """Return the numbers (N,) of a list, which may hold lists."""
+    words = [entries]
+    while any(isinstance(word, list) for word in words):
+        words = [inner for word in words for inner in (word if isinstance(word, list) else [word])]
     try:
         # FileStorage writes .Nan and .Inf.
-        values = torch.tensor(
-            [float(word.replace(".N", "n").replace(".I", "i")) for word in words], dtype=torch.float64
-        )
-    except ValueError as error:
+        numbers = [float(word.replace(".N", "n").replace(".I", "i")) for word in words]
+    except (AttributeError, ValueError) as error:
         raise FormatError(f"{where} must hold numbers ({error})") from error
+    values = torch.tensor(numbers, dtype=torch.float64)
     if not bool(values.isfinite().all()):
         raise FormatError(f"{where} must be finite")
     return values
-
-
-def _after_brackets(text: str) -> list[int]:
-    """Return the positions behind closing brackets."""
-    return [mark.end() for mark in re.finditer(r"\]", text)]
 
 
 def _picture_size(values: Values, path: Path) -> tuple[int, int]:
