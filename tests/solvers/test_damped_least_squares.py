@@ -13,6 +13,7 @@ from torch.func import jacrev, vmap
 
 from tests.geometry.draws import D, rand, randn
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
+from torchreg.solvers.arrow import SharedRows
 from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
 from torchreg.solvers.levenberg_marquardt import Linearization, damped_step, levenberg_marquardt
 
@@ -288,3 +289,27 @@ def test_the_damped_step_is_marquardts():
     torch.testing.assert_close(
         damped_step(system, damping)[0], -torch.linalg.solve(damped, gradient), rtol=1e-8, atol=0
     )
+
+
+def test_rows_that_share_unknowns_reach_the_joint_minimum():
+    """Two groups of three rows with two unknowns of their own and two shared ones, against one lstsq a group."""
+    slopes, values = randn(6, 5, 4), randn(6, 5)
+
+    def linearize(rows):
+        residual = (slopes @ rows.unsqueeze(-1)).squeeze(-1) - values
+        gradient = (slopes.mT @ residual.unsqueeze(-1)).squeeze(-1)
+        return Linearization(0.5 * residual.square().sum(-1), gradient, slopes.mT @ slopes)
+
+    free, start = torch.full((4,), torch.inf, dtype=D), torch.zeros(6, 4, dtype=D)
+    shared = SharedRows(torch.add, count=3, own=2)
+    found = shared.descend(
+        linearize, start, lower=-free, upper=free, max_steps=30, cost=lambda rows: linearize(rows).cost
+    )
+    step = shared.step(linearize(start), start, lower=-free, upper=free, damping=0.0)
+    for group in range(2):
+        one, right = slopes[3 * group : 3 * group + 3], values[3 * group : 3 * group + 3].flatten()
+        joint = torch.cat([torch.block_diag(*one[..., :2]), one[..., 2:].flatten(0, 1)], dim=1)
+        solution = torch.linalg.lstsq(joint, right).solution
+        expected = torch.cat([solution[:6].reshape(3, 2), solution[6:].expand(3, 2)], dim=1)
+        for rows in (found.state, step.state):
+            torch.testing.assert_close(rows[3 * group : 3 * group + 3], expected, atol=1e-7, rtol=1e-7)
