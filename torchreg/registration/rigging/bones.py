@@ -14,8 +14,8 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.upright import Y_UP, Direction
-from torchreg.registration.bones.joint_moments import JointMoments
-from torchreg.registration.bones.joints import Joints, bone_tree, find_joints
+from torchreg.registration.bones.joint_moments import gaps_at, motion_differences
+from torchreg.registration.bones.joints import Joints, bone_tree
 from torchreg.registration.results import SequenceRegistration
 from torchreg.shapes.articulated import ArticulatedShape
 
@@ -37,7 +37,7 @@ class _Joining:
     share: float = 0.005  # of all points
     relative: float = 0.2  # of the points of the largest part of the bone
     reach: float = 0.1  # diagonals from its own points, to which a bone is blended
-    turn: float = 0.3  # radians, at which motions locate a joint as well as the middle of what bones share does
+    rounds: int = 4  # of a joint and of how well the motions of its bones locate it
 
 
 _JOINING = _Joining()
@@ -185,13 +185,32 @@ def _joints(points: Tensor, weights: Tensor, edges: Tensor, part: Tensor, motion
     edges = edges[part[edges[:, 0]] != part[edges[:, 1]]]
     pairs, pair = part[edges].sort(dim=1).values.unique(dim=0, return_inverse=True)
     border, ends = torch.bincount(pair, minlength=len(pairs)).to(points), points[edges]
-    shared = weights[:, pairs[:, 0]] * weights[:, pairs[:, 1]]
-    center = (shared.mT @ points).index_add(0, pair, ends.mean(1)) / (shared.sum(0) + border)[:, None]
+    middles, shared = ends.mean(1), weights[:, pairs[:, 0]] * weights[:, pairs[:, 1]]
+    center = (shared.mT @ points).index_add(0, pair, middles) / (shared.sum(0) + border)[:, None]
     length = torch.full_like(border, torch.inf).scatter_reduce(0, pair, (ends[:, 0] - ends[:, 1]).norm(dim=-1), "amin")
-    moments = JointMoments(pairs, border, center, center.new_zeros(len(pairs), 3, 3))
-    found = find_joints(moments, motions, regularization=_JOINING.turn**2)
-    off = found.gaps.mean(0) + (found.centers - center).norm(dim=-1) + length
-    return replace(found, mass=border / off)
+    spread = (middles - center[pair]).square().sum(-1)
+    spread = torch.zeros_like(border).index_add(0, pair, spread) / border
+    centers, gaps = _located(center, spread, motion_differences(motions, pairs))
+    off = gaps.mean(0) + (centers - center).norm(dim=-1) + length
+    return Joints(pairs, centers, border / off, gaps)
+
+
+def _located(center: Tensor, spread: Tensor, differences: Tensor) -> tuple[Tensor, Tensor]:
+    """Return joints (P, 3) and their gaps (T, P) in all frames, by differences (T, P, 3, 4) of their bones' motions.
+
+    ``argmin_c mean |(R_i - R_j) c + t_i - t_j|^2 / g^2 + |c - m|^2 / s^2``: m is the center (P, 3) of the border, s^2
+    the squared spread (P,) of its points, and g^2 the mean squared gap that is left, estimated in turn. Errors of
+    motions last, so that frames do not count as independent.
+    """
+    turn, offsets = differences[..., :3], gaps_at(differences, center)
+    normal, right = (turn.mT @ turn).mean(0), (turn.mT @ offsets.unsqueeze(-1)).squeeze(-1).mean(0)
+    identity, ratio = torch.eye(3).to(center), torch.ones_like(spread)
+    least = torch.finfo(center.dtype).eps ** 0.5
+    for _ in range(_JOINING.rounds):
+        centers = center - torch.linalg.solve(normal + ratio[:, None, None] * identity, right)
+        gaps = torch.linalg.vector_norm(gaps_at(differences, centers), dim=-1)
+        ratio = (gaps.square().mean(0) / spread.clamp_min(torch.finfo(center.dtype).tiny)).clamp_min(least)
+    return centers, gaps
 
 
 def _parents_first(parents: Sequence[int]) -> list[int]:
