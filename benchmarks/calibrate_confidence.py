@@ -1,7 +1,7 @@
 """Fits the models of an alignment's confidence: limbs in pictures, whole pictures, and poses by family.
 
     python benchmarks/calibrate_confidence.py --data SHARED --rooms 80 --count 200   # prints all models; hours
-    python benchmarks/calibrate_confidence.py --smoke                                  # to see that it runs
+    python benchmarks/calibrate_confidence.py --smoke              # 3 rooms, 6 others: 30 CPU s, to see that it runs
 
 Alignments are drawn as by confidence.py (clouds and cut pictures of hands, with SHARED a robot arm and a fox) and by
 scenes.py, on seeds that neither measures: hands among other things, hands that hold things, arms, and rooms without
