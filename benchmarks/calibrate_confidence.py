@@ -1,7 +1,7 @@
 """Fits the models of an alignment's confidence: limbs in pictures, whole pictures, and poses by family.
 
     python benchmarks/calibrate_confidence.py --data SHARED --rooms 80 --count 200   # prints all models; hours
-    python benchmarks/calibrate_confidence.py --smoke                                  # to see that it runs
+    python benchmarks/calibrate_confidence.py --smoke              # 3 rooms, 6 others: 30 CPU s, to see that it runs
 
 Alignments are drawn as by confidence.py (clouds and cut pictures of hands, with SHARED a robot arm and a fox) and by
 scenes.py, on seeds that neither measures: hands among other things, hands that hold things, arms, and rooms without
@@ -10,8 +10,8 @@ is judged again by the models fitted before it:
 
 1. `LimbModel`: whether the end of a limb is off by at most a tenth of the shape's size, where most limbs are right;
 2. `PictureModel`: whether a pose lies about on the shape, at even odds before;
-3. `Calibration`: whether a pose is right, by the evidence that uses both; in rooms, and elsewhere with a bias for each
-   family of shapes.
+3. `Calibration`: whether a pose is right, by the evidence that uses both; with weights for rooms and for elsewhere, and
+   a bias for each family of shapes.
 
 The table is of models of poses fitted to the other cases, five times without a fifth of the seeds.
 """
@@ -45,7 +45,8 @@ from torchreg.alignment.evidence.reliability import Calibration
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.solvers.calibration import fit_logistic
 
-FOLDS, MISPLACED, ABOUT, BIAS_STD, ROOM = 5, 0.1, 0.15, 1.0, "room"
+FOLDS, MISPLACED, ABOUT, BIAS_STD = 5, 0.1, 0.15, 1.0
+ROOM_FAMILIES = {"hand": "room with a hand", "held": "room with a hand", "arm": "room with a robot"}
 LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed to doubt it
 FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
 
@@ -72,6 +73,11 @@ class Judged:
     is_answer: bool
     views: list[Any] = field(default_factory=list)
     evidence: Tensor | None = None
+
+    @property
+    def in_room(self) -> bool:
+        """Whether it is of a whole picture."""
+        return self.family in ROOM_FAMILIES.values()
 
     @property
     def size(self) -> float:
@@ -106,7 +112,7 @@ def in_rooms(kind: str, seed: int, there: bool) -> Iterator[Judged]:
         if there and scene.keypoints is not None:
             ends = (scene.shape.keypoints(pose) - scene.keypoints)[4::4].norm(dim=-1)
         yield Judged(
-            kind=f"room, {kind}", family=ROOM, seed=seed, told=told, ends=ends,
+            kind=f"room, {kind}", family=ROOM_FAMILIES[kind], seed=seed, told=told, ends=ends,
             right=scene.is_right(pose), near=scene.is_near(pose, told[0].size), is_answer=told is calls[-1],
         )  # fmt: skip
 
@@ -161,9 +167,12 @@ def judge_again(cases: Sequence[Judged], limbs: LimbModel, pictures: PictureMode
 
 
 def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
-    """Return the model of whether a pose is right of each family; rooms have weights of their own, too."""
-    rooms = [case for case in cases if case.family == ROOM]
-    return by_family(rooms) | by_family([case for case in cases if case.family != ROOM])
+    """Return the model of whether a pose is right of each family; rooms have weights of their own, too.
+
+    In a room, poses from a network's start have no rivals: they choose a crop, and what they find is judged again.
+    """
+    told = [case for case in cases if not case.in_room or case.told[2] is not None]
+    return by_family([case for case in told if case.in_room]) | by_family([case for case in told if not case.in_room])
 
 
 def by_family(cases: Sequence[Judged]) -> dict[str, Calibration]:
@@ -190,12 +199,15 @@ def rights(cases: Sequence[Judged]) -> Tensor:
 
 
 def crossed(cases: Sequence[Judged]) -> Tensor:
-    """Return the confidence (N,) in each case by models of poses that were fitted without a fifth of the seeds."""
+    """Return the confidence (N,) in each case by models of poses that were fitted without a fifth of the seeds.
+
+    It is zero where no other case is of a family.
+    """
     found = torch.zeros(len(cases), dtype=torch.float64)
     for fold in range(FOLDS):
         models = fitted_poses([case for case in cases if case.seed % FOLDS != fold])
         for number, case in enumerate(cases):
-            if case.seed % FOLDS == fold:
+            if case.seed % FOLDS == fold and case.family in models:
                 found[number] = models[case.family].probability(case.evidence.double())
     return found
 

@@ -12,7 +12,7 @@ from torchreg.datasets.cloud_clutter import Clutter
 SIZE = 0.26
 BARE = {
     "noise": (1e-6, 1e-6), "outliers": 0.0, "whole": 0.0, "hole": 0.0, "thinned": 0.0, "stretch": 0.0, "forearm": 0.0,
-    "neighbor": 0.0, "scene": 0.0,
+    "neighbor": 0.0,
 }  # fmt: skip
 
 
@@ -30,7 +30,7 @@ def drawn(plain_hand, skin, monkeypatch):
         monkeypatch.setattr(cloud_batches, "_VARIETY", variety)
         generator = torch.Generator().manual_seed(2)
         poses = cloud_batches.random_poses(plain_hand, 8, generator)
-        return cloud_batches.random_clouds(skin, SIZE, poses, 300, generator)
+        return cloud_batches.random_clouds(skin, SIZE, poses, 300, generator, in_scenes="scene" in changes)
 
     return draw
 

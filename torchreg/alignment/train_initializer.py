@@ -219,7 +219,7 @@ class _Run:
 
     def _clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
         poses = random_poses(self.shape, count, generator)
-        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator)
+        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator, in_scenes=True)
 
     def _rate(self) -> float:
         """Return the learning rate: a short rise, then half a cosine."""

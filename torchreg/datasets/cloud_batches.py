@@ -111,22 +111,29 @@ def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator
 
 @torch.no_grad()
 def random_clouds(
-    skin: LinearBlendSkin, size: float, poses: Tensor, num_points: int, generator: torch.Generator
+    skin: LinearBlendSkin,
+    size: float,
+    poses: Tensor,
+    num_points: int,
+    generator: torch.Generator,
+    *,
+    in_scenes: bool = False,
 ) -> CloudBatch:
     """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, of a size in metres.
 
-    Proportions differ a little from the shape's; some hands have a forearm, and some clouds a second object. Half are
-    windows of scenes: with tables, with things near the shape or held by it, or without the shape.
+    Proportions differ a little from the shape's; some hands have a forearm, and some clouds a second object.
+    ``in_scenes``: half are windows of scenes: with tables, with things near the shape or held by it, or without it.
     """
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)
-    draw = _Draw(generator, surface, size)
+    draw = _Draw(generator, surface, size, _VARIETY.scene if in_scenes else 0.0)
     forearm = _VARIETY.forearm if isinstance(skin.shape, Hand) else 0.0
     scene = draw.scene(surface, normals, poses[:, :3], forearm)
     visible, slant = draw.visible(scene.points, scene.normals)
     whole = draw.uniform(len(poses), 1) < _VARIETY.whole
     weight = scene.weight * torch.where(whole, 1.0, torch.where(visible, slant, 0.0))
-    weight = torch.where(draw.inside(scene, weight, surface.mean(1)), weight, 0.0)
+    if in_scenes:
+        weight = torch.where(draw.inside(scene, weight, surface.mean(1)), weight, 0.0)
     # Without replacement, by the largest of the logarithms and Gumbel noise.
     ranks = weight.log() - draw.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
     score, index = ranks.topk(min(num_points, ranks.shape[1]), dim=1)
@@ -156,6 +163,7 @@ class _Draw:
     generator: torch.Generator
     like: Tensor
     size: float
+    scenes: float  # share of the clouds
 
     def uniform(self, *size: int) -> Tensor:
         return torch.rand(size, generator=self.generator, device=self.generator.device).to(self.like)
@@ -173,19 +181,25 @@ class _Draw:
         # Normals turn by as little as the proportions differ.
         stretch = axes @ (scale * axes.mT)
         surface = (surface - base.unsqueeze(1)) @ stretch + base.unsqueeze(1)
-        is_window = self.uniform(batch, 1) < _VARIETY.scene
-        absent = is_window & (self.uniform(batch, 1) < _VARIETY.absent)
+        is_window, absent = torch.zeros(2, batch, 1, dtype=torch.bool, device=surface.device)
+        if self.scenes:
+            is_window = self.uniform(batch, 1) < self.scenes
+            absent = is_window & (self.uniform(batch, 1) < _VARIETY.absent)
         shown = torch.where(absent, 0.0, 1.0).expand(-1, count)
         parts, middle = [(surface, normals, shown)], surface.mean(1)
-        clutter = Clutter(self.generator, self.like, self.size)
-        for share, (points, facing), is_part in (
+        extras = [
             (forearm, self.forearm(base, middle), ~absent),
             (_VARIETY.neighbor, self.neighbor(surface, normals), ~is_window),
-            (_VARIETY.plane, clutter.plane(middle), is_window),
-            (_VARIETY.thing, clutter.near(middle), is_window),
+        ]
+        if self.scenes:
+            clutter = Clutter(self.generator, self.like, self.size)
+            extras += [
+                (_VARIETY.plane, clutter.plane(middle), is_window),
+                (_VARIETY.thing, clutter.near(middle), is_window),
+                (_VARIETY.thing, clutter.held(surface, normals), is_window),
+            ]
+        for share, (points, facing), is_part in extras:
             # Something is left where the shape is not.
-            (_VARIETY.thing, clutter.held(surface, normals), is_window),
-        ):
             there = ((self.uniform(batch, 1) < share) | (absent & is_part)) & is_part
             often = self.between(_VARIETY.extra_points, batch, 1) * count / points.shape[1]
             parts.append((points, facing, torch.where(there, often, 0.0).expand(-1, points.shape[1])))

@@ -13,7 +13,7 @@ from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL
 from torchreg.alignment.evidence.reliability import CALIBRATION, shown_probability
 from torchreg.alignment.results import AlignResult, PoseStarts
-from torchreg.alignment.search.crops import LikelyCrop, likely_crops
+from torchreg.alignment.search.crops import LikelyCrop, crop_about, likely_crops
 from torchreg.alignment.search.pose_proposer import PoseProposer
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.result import Status
@@ -56,6 +56,8 @@ def align_in_picture(
         return aligned(crop.frame, config=quick, start=crop.start)
 
     found, crop = surest_crop(frame, skin, answer, proposer)
+    if proposer is not None and crop.start is not None:
+        crop = replace(crop, frame=crop_about(frame, skin, proposer, found.pose) or crop.frame)
     is_sure = _confidence(found) >= CHOICE.enough or config.search == "never" or found.coefficients is not None
     if crop.start is not None or not is_sure:
         found = aligned(crop.frame, config=config)
