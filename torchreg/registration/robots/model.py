@@ -154,9 +154,10 @@ def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tupl
     """Return motions (T, K, 4, 4) and labels (n,), those of links found one after another where parts do not fit."""
     motions = surfaces.refined(motions, label, [scale * surfaces.spacing for scale in GROWTH.others])
     state = Growth(surfaces, motions, label).labeled()
-    if float((state.label >= 0).double().mean()) < GROWTH.registered:
-        state = Growth.rooted(surfaces, motions)
-    return grown(state)
+    if float((state.label >= 0).double().mean()) >= GROWTH.registered:
+        return grown(state)
+    found, new = grown(Growth.rooted(surfaces, motions))
+    return torch.cat([motions, found], 1), new + motions.shape[1]
 
 
 def compared_with_each_other(
