@@ -320,7 +320,8 @@ def show(arm: Arm, name: str, as_clouds: bool) -> None:
         dict(zip([j.name for j in robot.tree.joints[1:]], row, strict=True)) for row in robot.joint_values.tolist()
     ]
     poses = torch.tensor([[0.0] * 6 + [row[dof] for dof in shape.dof_names[6:]] for row in values], dtype=torch.float64)
-    order = [shape.part_names.index(f"link_{number}") for number in range(len(robot.tree))]
+    # A link without points has no part, and no point moves with it.
+    order = [{name: n for n, name in enumerate(shape.part_names)}.get(f"link_{k}", 0) for k in range(len(robot.tree))]
     frames = robot.base.unsqueeze(1) @ shape.part_transforms(poses)[:, order]
     local = found.points - robot.origins()[robot.part]
     chosen = frames[:, robot.part]

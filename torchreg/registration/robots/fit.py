@@ -21,6 +21,7 @@ class FitNumbers:
 
     scales: tuple[float, ...] = (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of robust kernels, step by step, standard deviations
     wide: tuple[float, ...] = (0.04, 0.03, 0.02, 0.01)  # of the thing's size: steps from a neighboring frame's pose
+    left: float = 2.0  # last steps of an axis that it is from its end: each is about two thirds of the one before
     damping: float = 1e-3  # of the mean curvature of a part's motion, for what the data do not hold
 
 
@@ -216,13 +217,13 @@ def axis_stds(
 ) -> tuple[Tensor, Tensor]:
     """Return standard deviations (K,) of the joints' directions, radians, and of their axes at points (K, 3).
 
-    ``steps``: (K, 6) last steps of the axes. As each is about half of the one before, as much is left.
+    ``steps``: (K, 6) last steps of the axes, which are not at their end.
     """
     motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)
     system = _System.of(surfaces, mechanism, label, scale)
     everything = system.axes_covariance(noise.sigma**2 * noise.repeats, *surfaces.piecewise(motions, label, scale))
     own = everything[: 6 * size, : 6 * size].reshape(size, 6, size, 6)[range(size), :, range(size)]
-    own = own + steps.unsqueeze(-1) * steps.unsqueeze(-2)
+    own = own + FIT.left**2 * steps.unsqueeze(-1) * steps.unsqueeze(-2)
     turns = mechanism.axes[:, 3:].any(-1)
     directions = torch.where(turns.unsqueeze(-1), mechanism.axes[:, 3:], mechanism.axes[:, :3])
     # A twist (v, w) turns a direction a by w x a, and moves a point p of the axis by v + w x p, what counts across it.

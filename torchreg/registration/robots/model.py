@@ -103,10 +103,10 @@ def find_robot(
     Parts, and pieces of them, propose motions; samples take those of least description length. Two links that touch
     hold together, turn, slide or move freely, by the criterion of Schwarz on what the data hold of their relative
     motions; those that hold together are one. Between two may be a link that no scan shows to turn, with a hinge at
-    either end. The joints of most evidence make a tree, whose axes and values are fitted
-    to all scans together; links and joints are then looked for once more from there. In ``sparse`` scans, points whose
-    normals are estimates, links are also looked for one after another, which needs no registration; last, these scans
-    are compared with each other on each link.
+    either end. The joints of most evidence make a tree, whose axes and values are fitted to all scans together; links
+    and joints are then looked for once more from there. In ``sparse`` scans, points whose normals are estimates and may
+    have wrong signs, links are also looked for one after another, which needs no registration; last, these scans are
+    compared with each other on each link.
 
     ``part``: (N,) labels of bones, at least as many as links that registration tells apart (Isack and Boykov 2012 for
     the links; Schwarz 1978 for the tests; Chow and Liu 1968 for the tree of most evidence).
@@ -127,6 +127,7 @@ def find_robot(
     for _ in range(MODEL.rounds):
         if sparse:
             motions, label = with_grown_links(surfaces, motions, label)
+            surfaces = surfaces.with_signs(motions, label)
         motions, label, noise = find_links(surfaces, motions, label)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
         mechanism, label = assembled(surfaces, motions, label, joints, noise)
@@ -153,9 +154,10 @@ def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tupl
     """Return motions (T, K, 4, 4) and labels (n,), those of links found one after another where parts do not fit."""
     motions = surfaces.refined(motions, label, [scale * surfaces.spacing for scale in GROWTH.others])
     state = Growth(surfaces, motions, label).labeled()
-    if float((state.label >= 0).double().mean()) < GROWTH.registered:
-        state = Growth.rooted(surfaces, motions)
-    return grown(state)
+    if float((state.label >= 0).double().mean()) >= GROWTH.registered:
+        return grown(state)
+    found, new = grown(Growth.rooted(surfaces, motions))
+    return torch.cat([motions, found], 1), new + motions.shape[1]
 
 
 def compared_with_each_other(

@@ -24,6 +24,7 @@ class SurfaceNumbers:
     cut: float = 3.0  # standard deviations from which a residual is an outlier's
     to_deviation: float = 1.4826  # from the median of absolute values to the standard deviation of a normal law
     patch: int = 20  # samples in a patch, over which noise is averaged to see how it is correlated
+    signs: float = 0.95  # of the samples: of those whose motions are right, 97 of 100 agree where signs are right
     reach: float = 4.0  # scales of a robust kernel, beyond which no counterpart is looked for
     damping: float = 1e-2  # of the mean curvature, added where data do not hold a motion
 
@@ -138,6 +139,16 @@ class Surfaces:
     def spacing(self) -> float:
         """Mean distance between points of a scan."""
         return sum(target.spacing for target in self.targets) / len(self.targets)
+
+    def with_signs(self, motions: Tensor, label: Tensor) -> Surfaces:
+        """Return the samples, and the scans: signs of normals are used in those where nearly all are the samples'."""
+        targets = []
+        for target, frame in zip(self.targets, motions, strict=True):
+            points, normals = self.moved(frame[label])
+            _, facing, square = target.residuals(points, normals, target.spacing)
+            same = ((facing * normals).sum(-1) > 0)[square.isfinite()]
+            targets.append(target.facing(target.normals) if float(same.double().mean()) > NUMBERS.signs else target)
+        return replace(self, targets=tuple(targets))
 
     def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return samples and normals (..., n, 3) under motions (..., n, 4, 4)."""
