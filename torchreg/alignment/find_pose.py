@@ -169,7 +169,7 @@ def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> Fo
         typical = shifted(typical_poses(shape).mean(0).expand(len(batch), -1), origin)
         problem = centered_problem(
             task.skin(), batch, batch_valid, typical, origin, prior_std=config.prior_std,
-            pose_atol=task.config.pose_atol, free_space=seen.free_space, keypoints=seen.keypoints,
+            pose_atol=0.0, free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
             problem = known.with_prior(problem, shifted(known.start(shape).expand_as(typical), -origin))
