@@ -105,11 +105,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=32, help="pictures of each kind")
     parser.add_argument("--kinds", nargs="+", choices=tuple(KINDS), default=list(KINDS), help="of scenes")
+    parser.add_argument("--start", type=int, default=0, help="seed of the first")
     parser.add_argument("--list", action="store_true", help="print every scene, too")
     parser.add_argument("--smoke", action="store_true", help="two pictures")
     given = parser.parse_args(arguments)
     count, kinds = (2, ["hand"]) if given.smoke else (given.count, given.kinds)
-    chosen = list(cases(kinds, count))
+    chosen = list(cases(kinds, count, given.start))
     bar = tqdm(chosen, desc="pictures", leave=False, disable=None)
     rows = []
     for case in bar:
