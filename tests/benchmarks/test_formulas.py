@@ -102,12 +102,12 @@ def test_true_correspondences_have_the_largest_logits(load):
 
 def test_each_family_has_a_bias_of_its_own_and_each_case_is_judged_by_models_of_others(load):
     bench, generator, cases = load("calibrate_confidence"), torch.Generator().manual_seed(0), []
-    truths = {"hand": 2.0, "rig": 0.5, bench.ROOM: 1.0}
+    truths = {"hand": 2.0, "rig": 0.5, "room with a hand": 1.0}
     for seed in range(3000):
         family, evidence = list(truths)[seed % 3], torch.rand(2, generator=generator)
         odds = truths[family] - evidence @ tensor([4.0, 1.0])
         cases.append(bench.Judged(
-            kind=family, family=family, seed=seed, told=(), ends=None, near=True, is_answer=True, evidence=evidence,
+            kind=family, family=family, seed=seed, told=(None, None, 0.0), ends=None, near=True, is_answer=True, evidence=evidence,
             right=bool(torch.rand((), generator=generator) < odds.sigmoid()),
         ))  # fmt: skip
     models = bench.fitted_poses(cases)
