@@ -107,8 +107,8 @@ def test_each_family_has_a_bias_of_its_own_and_each_case_is_judged_by_models_of_
         family, evidence = list(truths)[seed % 3], torch.rand(2, generator=generator)
         odds = truths[family] - evidence @ tensor([4.0, 1.0])
         cases.append(bench.Judged(
-            kind=family, family=family, seed=seed, told=(None, None, 0.0), ends=None, near=True, is_answer=True, evidence=evidence,
-            right=bool(torch.rand((), generator=generator) < odds.sigmoid()),
+            kind=family, family=family, seed=seed, told=(None, None, 0.0), ends=None, near=True,
+            is_answer=True, evidence=evidence, right=bool(torch.rand((), generator=generator) < odds.sigmoid()),
         ))  # fmt: skip
     models = bench.fitted_poses(cases)
     assert models["hand"].weights == models["rig"].weights
