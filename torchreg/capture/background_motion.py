@@ -18,7 +18,7 @@ from torchreg.solvers.robust import geman_mcclure_weight
 class _Rule:
     """Numbers of the search. Depth errors are at one metre; they grow with the square of the depth."""
 
-    widest: float = 0.1  # first width of the kernel, and prior of the motion, metres and radians: a camera in a hand
+    widest: float = 0.1  # first width of the kernel, metres; std of a camera's motion in a hand, metres and radians
     ratio: float = 0.7  # from one width to the next
     num_steps: int = 25
     deviations: float = 2.0  # of the noise, the last width

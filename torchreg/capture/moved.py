@@ -76,7 +76,7 @@ def moved_masks(source: DepthFrame, target: DepthFrame) -> MovedMasks:
 
     Differentiable: no.
 
-    Cost: 0.2 s for 320 x 240 pixels.
+    Cost: 0.5 s for 320 x 240 pixels.
     """
     for name, frame in (("source", source), ("target", target)):
         if not isinstance(frame, DepthFrame):
