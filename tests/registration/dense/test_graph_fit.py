@@ -73,6 +73,21 @@ def test_steps_are_those_of_a_dense_gauss_newton(graph, each):
     torch.testing.assert_close(reported, torch.stack(energy(graph, transforms, matches, 0.7)[:2]))
 
 
+def test_sets_of_matches_add_up_each_by_its_own_mean(graph):
+    transforms, matches = problem(graph)
+    others = GraphMatches(slice(0, 30), graph.points[:30] + 0.05, torch.linspace(0, 2, 30, dtype=F64), None, 0.4)
+    both = GraphMatches(
+        torch.cat([matches.which, torch.arange(30)]),
+        torch.cat([matches.targets, others.targets]),
+        torch.cat([matches.weights / 40, others.weights / 30]) * 70,
+        torch.cat([matches.normals, torch.zeros(30, 3, dtype=F64)]),
+        torch.cat([torch.full((40,), 0.3), torch.full((30,), 0.4)]).to(F64),
+    )
+    one, two = fit_graph(graph, transforms, both, 0.7), fit_graph(graph, transforms, [matches, others], 0.7)
+    torch.testing.assert_close(two.transforms, one.transforms, rtol=1e-9, atol=1e-9)
+    assert two.residual == pytest.approx(one.residual)
+
+
 def test_steps_end_where_the_gradient_vanishes(graph):
     transforms, matches = problem(graph)
     fitted = fit_graph(graph, transforms, matches, 0.05, num_steps=30).transforms

@@ -117,9 +117,10 @@ def test_tables_share_out_what_is_visible(prior):
     torch.testing.assert_close(prior.source.sum(1), torch.ones(60, dtype=F64))
     assert int((prior.source > 0).sum(1).max()) == int((prior.target > 0).sum(1).max()) == 3
     assert torch.equal(prior.source[:TOKENS].argmax(1), torch.arange(TOKENS))
-    by_source, by_target = prior.tables(60, 90)
-    torch.testing.assert_close(by_source.sum(1), prior.visible)
-    torch.testing.assert_close(by_target.sum(0), prior.target_visible)
+    by_source, by_target = prior.tables
+    assert by_source.shape == by_target.shape == (TOKENS, 2 * OTHERS)
+    torch.testing.assert_close(by_source.sum(1), prior.visible[:TOKENS])
+    torch.testing.assert_close(by_target.sum(0), prior.target_visible[: 2 * OTHERS])
     assert 0 < float(prior.visible.min()) <= float(prior.visible.max()) <= 1
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.registration.annealing import geometric_at
-from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
+from torchreg.registration.dense.graph_fit import fit_graph
 from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.registration.dense.stages import Reporter
+from torchreg.registration.dense.stages import Reporter, match_tokens
 from torchreg.solvers.robust import geman_mcclure_weight
 
 # Rounds in which matches that do not fit a rigid motion count less and less.
@@ -35,7 +33,7 @@ def fit_coarsely(problem: ScanAlignProblem, reporter: Reporter) -> Tensor:
     for step in range(plan.num_steps):
         share = step / max(plan.num_steps - 1, 1)
         sigma, stiffness = geometric_at(plan.sigma, share), geometric_at(plan.stiffness, share)
-        matches = _expected_matches(problem, transforms, sigma, share)
+        matches = match_tokens(problem, transforms, sigma, share)
         fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=problem.config.edge_scale)
         transforms = fit.transforms
         reporter.report("match", step, plan.num_steps, sigma, fit, stiffness, float(matches.weights.mean()))
@@ -53,26 +51,3 @@ def rigid_start(prior: MatchPrior, source: Tensor, target: Tensor, width: float)
         apart = (transform_points(motion, tokens) - targets).square().sum(-1)
         weights = mass * geman_mcclure_weight(apart / width**2)
     return motion
-
-
-def _expected_matches(problem: ScanAlignProblem, transforms: Tensor, sigma: float, share: float) -> GraphMatches:
-    """Return the E-step of the samples that are tokens, a share of the way through."""
-    # As fine as the matcher; the target twice as much, for places between its tokens.
-    count, seen = problem.prior.by_source.shape
-    target = problem.target.first(2 * seen)
-    moved, normals = problem.graph.move_with_normals(transforms, slice(0, count))
-    near = torch.cdist(moved, target.points).square().mul_(-1 / (2 * sigma**2))
-    near = near.add_(normals @ target.normals.mT - 1, alpha=problem.config.normal_weight * share).exp_()
-    prior, doubt = problem.prior, problem.config.doubt
-    visible, shown = prior.visible[:count, None], prior.target_visible[: len(target)]
-    by_source, by_target = prior.tables(count, len(target))
-    # A density per area, as that of the Gaussian along the surface, the squared size being one.
-    outlier = 2 * math.pi * sigma**2
-    hidden, unshown = ((1 - share).clamp_min(torch.finfo(share.dtype).eps) for share in (visible, shown))
-    chosen = near * torch.lerp(by_source, visible / len(target), doubt)
-    choice = chosen / (chosen.sum(1, keepdim=True) + outlier * hidden)
-    chosen = near * torch.lerp(by_target, shown / count, doubt)
-    choice += (count / len(target)) * chosen / (chosen.sum(0) + outlier * unshown)
-    weights = choice.sum(1)
-    targets = choice @ target.points / weights.clamp_min(torch.finfo(weights.dtype).tiny).unsqueeze(1)
-    return GraphMatches(slice(0, count), torch.where(weights.unsqueeze(1) > 0, targets, moved), weights)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +30,7 @@ class GraphMatches:
         weights: (n,) how much each counts, not negative.
         normals: (n, 3) of the targets, or None for targets that hold in all directions alike.
         tangential_weight: how much a residual along the surface counts against one across it, squared; one number, or
-            (n,) of each; 1 without normals.
+            (n,) of each; without normals, in all directions.
     """
 
     which: Tensor | slice
@@ -62,7 +63,7 @@ class GraphFit:
 def fit_graph(
     graph: DeformationGraph,
     transforms: Tensor,
-    matches: GraphMatches,
+    matches: GraphMatches | Sequence[GraphMatches],
     stiffness: float,
     num_steps: int = 1,
     *,
@@ -74,7 +75,7 @@ def fit_graph(
     tangential weight, and gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`.
     With an ``edge_scale``, w_e is divided by ``1 + r_e^2 / edge_scale^2`` before each step, r_e the root mean square of
     the edge's two gaps: parts stay rigid, and what they do not share, joints take up. No step shifts a node by more
-    than the diagonal of the samples or the largest residual.
+    than the diagonal of the samples or the largest residual. Several sets of matches add up, each by its own mean.
 
     ``num_steps``: linear systems, at least one, none of them tested: the caller finds new matches before long.
     ``edge_scale``: see above, in the unit of the points; None for edges that are never let go.
@@ -85,12 +86,13 @@ def fit_graph(
     check_positive(stiffness, "stiffness", allow_zero=True)
     if edge_scale is not None:
         check_positive(edge_scale, "edge_scale")
+    several = [matches] if isinstance(matches, GraphMatches) else matches
     residual = smoothness = 0.0
     size = float((graph.points.amax(0) - graph.points.amin(0)).norm())
     for _ in range(num_steps):
         middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
         metrics, weighted_residuals, residual, smoothness, farthest = _costs(
-            graph, graph.sums.places(transforms), matches, stiffness, edge_scale
+            graph, graph.sums.places(transforms), several, stiffness, edge_scale
         )
         twists = _solved(
             *graph.sums.normal_equations(transforms, middles, metrics, weighted_residuals), max(size, farthest)
@@ -100,24 +102,25 @@ def fit_graph(
 
 
 def _costs(
-    graph: DeformationGraph, places: Tensor, matches: GraphMatches, stiffness: float, edge_scale: float | None
+    graph: DeformationGraph, places: Tensor, matches: Sequence[GraphMatches], stiffness: float, edge_scale: float | None
 ) -> tuple[Tensor, Tensor, float, float, float]:
     """Return metrics (S + 2 E, 6), weighted residuals (S + 2 E, 3), costs of samples and gaps, the largest residual."""
-    count, shares = len(graph.points), matches.weights / max(1, len(matches.weights))
+    count, residual, farthest = len(graph.points), 0.0, 0.0
     metrics, weighted_residuals = places.new_zeros(len(places), 6), places.new_zeros(len(places), 3)
-    residual = places[:count][matches.which] - matches.targets
-    weighted_residual = torch.as_tensor(matches.tangential_weight).to(residual).reshape(-1, 1) * residual
-    if matches.normals is not None:
-        weighted_residual = weighted_residual + matches.normals * (matches.normals * residual).sum(-1, keepdim=True)
-    weighted_residual = shares.unsqueeze(1) * weighted_residual
-    for sums, part in (
-        (metrics, upper_triangles(shares, matches.normals, matches.tangential_weight)),
-        (weighted_residuals, weighted_residual),
-    ):
-        if isinstance(matches.which, slice):
-            sums[:count][matches.which] = part
-        else:
-            sums.index_add_(0, matches.which, part)
+    for each in matches:
+        shares, off = each.weights / max(1, len(each.weights)), places[:count][each.which] - each.targets
+        weighted = torch.as_tensor(each.tangential_weight).to(off).reshape(-1, 1) * off
+        if each.normals is not None:
+            weighted = weighted + each.normals * (each.normals * off).sum(-1, keepdim=True)
+        weighted = shares.unsqueeze(1) * weighted
+        metric = upper_triangles(shares, each.normals, each.tangential_weight)
+        for sums, part in ((metrics, metric), (weighted_residuals, weighted)):
+            if isinstance(each.which, slice):
+                sums[:count][each.which] += part
+            else:
+                sums.index_add_(0, each.which, part)
+        residual += float((off * weighted).sum())
+        farthest = max(farthest, float(off.norm(dim=-1).max())) if len(off) else farthest
     gap = places[count:].view(-1, 2, 3)
     apart = gap.square().sum((1, 2))
     weights = (
@@ -126,14 +129,7 @@ def _costs(
     held = (stiffness / graph.num_nodes * weights).repeat_interleave(2)
     metrics[count:] = upper_triangles(held, None, 1.0)
     weighted_residuals[count:] = held.unsqueeze(1) * places[count:]
-    farthest = float(residual.norm(dim=-1).max()) if len(residual) else 0.0
-    return (
-        metrics,
-        weighted_residuals,
-        float((residual * weighted_residual).sum()),
-        float((weights * apart).sum()) / graph.num_nodes,
-        farthest,
-    )
+    return metrics, weighted_residuals, residual, float((weights * apart).sum()) / graph.num_nodes, farthest
 
 
 def _solved(gradient: Tensor, matrix: Tensor, farthest: float) -> Tensor:

@@ -47,7 +47,8 @@ class MatchPrior:
     @classmethod
     def of_samples(cls, source: OrientedSamples, target: OrientedSamples, count: int) -> MatchPrior:
         """Return what the matcher of torchreg says of samples, the first ``count`` of the source alone."""
-        tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (source, target))
+        scans = (source, target)
+        tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary, num_tokens=None) for scan in scans)
         logits = _matcher()(*tokens)[0].to(source.points)
         return cls.of_logits(logits, source.points[:count], target.points)
 
@@ -67,12 +68,14 @@ class MatchPrior:
         """(T,) probability that the source shows each sample of the target."""
         return self.target @ self.by_target.sum(0)
 
-    def tables(self, count: int, seen: int) -> tuple[Tensor, Tensor]:
-        """Return probabilities (n, m) of matches of the first samples of both scans, by source and by target.
+    @cached_property
+    def tables(self) -> tuple[Tensor, Tensor]:
+        """Probabilities (A, 2 B) of matches of the source's tokens and twice as many samples of the target as it has.
 
-        What a token has is shared among the samples about it, so that rows and columns sum to what is visible.
+        By source and by target. What a token has is shared among the samples about it, so that rows and columns sum to
+        what is visible.
         """
-        here, there = self.source[:count], self.target[:seen]
+        here, there = self.source[: self.by_source.shape[0]], self.target[: 2 * self.by_source.shape[1]]
         tiny = torch.finfo(here.dtype).tiny
         one = here @ self.by_source @ (there / there.sum(0).clamp_min(tiny)).mT
         other = (here / here.sum(0).clamp_min(tiny)) @ self.by_target @ there.mT

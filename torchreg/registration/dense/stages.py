@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -53,8 +54,12 @@ class Reporter:
 
 
 def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Tensor:
-    """Return motions refined by EM: sigma shrinks, and the graph softens."""
-    config, plan = problem.config, problem.config.refine
+    """Return motions refined by EM: sigma shrinks, and the graph softens.
+
+    Samples on a surface tell little of where they lie along it: there the matches of the tokens count beside theirs, as
+    much less as their sigma, at which the coarse EM ends, is larger.
+    """
+    config, plan, coarse = problem.config, problem.config.refine, problem.config.coarse.sigma[1]
     for step in range(plan.num_steps):
         share = step / max(plan.num_steps - 1, 1)
         sigma, stiffness = geometric_at(plan.sigma, share), geometric_at(plan.stiffness, share)
@@ -63,11 +68,38 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
         matches = GraphMatches(
             slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
         )
-        fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=config.edge_scale)
+        tokens = match_tokens(problem, transforms, coarse, 1.0)
+        # Each is chosen by two. Neighboring tokens err alike: they count as little as samples along the surface do.
+        weight = config.tangential_weight * (sigma / coarse) ** 2
+        tokens = replace(tokens, weights=0.5 * tokens.weights, tangential_weight=weight)
+        fit = fit_graph(problem.graph, transforms, [matches, tokens], stiffness, edge_scale=config.edge_scale)
         transforms = fit.transforms
         matched = float(found.posterior.mean())
         reporter.report("refine", step, plan.num_steps, sigma, fit, stiffness, matched)
     return transforms
+
+
+def match_tokens(problem: ScanAlignProblem, transforms: Tensor, sigma: float, share: float) -> GraphMatches:
+    """Return the E-step of the samples that are tokens, a share of the way through; see `fit_coarsely`."""
+    # As fine as the matcher; the target twice as much, for places between its tokens.
+    count, seen = problem.prior.by_source.shape
+    target = problem.target.first(2 * seen)
+    moved, normals = problem.graph.move_with_normals(transforms, slice(0, count))
+    near = torch.cdist(moved, target.points).square().mul_(-1 / (2 * sigma**2))
+    near = near.add_(normals @ target.normals.mT - 1, alpha=problem.config.normal_weight * share).exp_()
+    prior, doubt = problem.prior, problem.config.doubt
+    visible, shown = prior.visible[:count, None], prior.target_visible[: len(target)]
+    by_source, by_target = prior.tables
+    # A density per area, as that of the Gaussian along the surface, the squared size being one.
+    outlier = 2 * math.pi * sigma**2
+    hidden, unshown = ((1 - share).clamp_min(torch.finfo(share.dtype).eps) for share in (visible, shown))
+    chosen = near * torch.lerp(by_source, visible / len(target), doubt)
+    choice = chosen / (chosen.sum(1, keepdim=True) + outlier * hidden)
+    chosen = near * torch.lerp(by_target, shown / count, doubt)
+    choice += (count / len(target)) * chosen / (chosen.sum(0) + outlier * unshown)
+    weights = choice.sum(1)
+    targets = choice @ target.points / weights.clamp_min(torch.finfo(weights.dtype).tiny).unsqueeze(1)
+    return GraphMatches(slice(0, count), torch.where(weights.unsqueeze(1) > 0, targets, moved), weights)
 
 
 def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float) -> SoftMatches:
