@@ -167,13 +167,13 @@ def rig_movie(path, rig, meshes, up=None):
     posed = MovingMesh("rig", rig.vertices().float() + beside, rig.shape.file_skin().faces, colors)
     scene = Scene("", (source, posed))
     view = watch(scene.sample(), camera=camera + beside / 2, up=upright, size=(2 * PANEL, PANEL))
-    animate_scene(path, scene, 8.0, view=view)
+    animate_scene(path, scene, 6.0, view=view)
     return f"{len(rig.joints)} bones; {float(rig.errors.nan_to_num(0.0).max()):.2%} of the diagonal in the worst frame"
 
 
 def draw_rig(folder, smoke):
     """A starfish meshed anew in every frame, beside its rig, by bones."""
-    meshes = list(creature_sequence(num_frames=2 if smoke else 16, resolution=40 if smoke else 96, seed=1).meshes)
+    meshes = list(creature_sequence(num_frames=2 if smoke else 8, resolution=40 if smoke else 96, seed=1).meshes)
     align = replace(tr.RegisterConfig().align, num_samples=300)
     config = tr.RigConfig(num_points=500, rounds=4, register=tr.RegisterConfig(align=align, num_samples=500))
     return rig_movie(folder / "rig.gif", tr.rig_sequence(meshes, config=config if smoke else None), meshes)
