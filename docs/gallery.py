@@ -17,11 +17,12 @@ from torchreg.datasets.creatures import creature_sequence
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.viz.animation import animate_scene
 from torchreg.viz.bone_colors import error_colors, weight_colors
 from torchreg.viz.figures import bending_picture, draw_scene, new_figure, save_picture, scene_view, watch
 from torchreg.viz.posed_scenes import posed_scene
 from torchreg.viz.result_scenes import result_scene
-from torchreg.viz.scene import MovingMesh, Scene
+from torchreg.viz.scene import Meshes, MovingMesh, Scene
 from torchreg.viz.spines import save_spine_movie
 
 HERE = Path(__file__).parent
@@ -155,20 +156,27 @@ def draw_spine(folder, smoke):
     return f"{spine.num_tips} tips; {same} of {len(meshes)} frames have the tree by themselves"
 
 
+def rig_movie(path, rig, meshes, up=None):
+    """Draw each frame's own mesh, to the right of it the rig by bones; return what is said of the rig."""
+    source = Meshes("source", meshes, TARGET)
+    camera, middle, upright = Scene("", (source,), up=up).camera()
+    right = torch.nn.functional.normalize(torch.linalg.cross(middle - camera, upright), dim=0)
+    points = torch.cat([mesh.vertices for mesh in meshes]).to(right) @ right
+    beside = (1.1 * (points.amax() - points.amin()) * right).float()
+    colors = weight_colors(rig.weights).clamp(0, 1).float()
+    posed = MovingMesh("rig", rig.vertices().float() + beside, rig.shape.file_skin().faces, colors)
+    scene = Scene("", (source, posed))
+    view = watch(scene.sample(), camera=camera + beside / 2, up=upright, size=(2 * PANEL, PANEL))
+    animate_scene(path, scene, 6.0, view=view)
+    return f"{len(rig.joints)} bones; {float(rig.errors.nan_to_num(0.0).max()):.2%} of the diagonal in the worst frame"
+
+
 def draw_rig(folder, smoke):
     """A starfish meshed anew in every frame, beside its rig, by bones."""
-    meshes = list(creature_sequence(num_frames=2 if smoke else 6, resolution=40 if smoke else 96, seed=1).meshes)
+    meshes = list(creature_sequence(num_frames=2 if smoke else 8, resolution=40 if smoke else 96, seed=1).meshes)
     align = replace(tr.RegisterConfig().align, num_samples=300)
     config = tr.RigConfig(num_points=500, rounds=4, register=tr.RegisterConfig(align=align, num_samples=500))
-    rig = tr.rig_sequence(meshes, config=config if smoke else None)
-    colors, faces, moved = weight_colors(rig.weights).clamp(0, 1), rig.shape.file_skin().faces, rig.vertices()
-    panels = []
-    for frame in (0, len(meshes) - 1):
-        mesh = MovingMesh("mesh", meshes[frame].vertices, meshes[frame].faces, TARGET)
-        posed = MovingMesh("rig", moved[frame].float(), faces, colors.float())
-        panels += [(f"frame {frame}", Scene("", (mesh,)), 0), ("rig, by bones", Scene("", (posed,)), 0)]
-    draw_row(folder / "rig.png", panels)
-    return f"{len(rig.joints)} bones; {float(rig.errors.max()):.2%} of the diagonal in the worst frame"
+    return rig_movie(folder / "rig.gif", tr.rig_sequence(meshes, config=config if smoke else None), meshes)
 
 
 def draw_bending(folder, smoke):
@@ -178,7 +186,7 @@ def draw_bending(folder, smoke):
 
 
 def draw_captured(folder, data):
-    """A captured dancer: a registered pair of range scans, and the spine of some frames."""
+    """A captured dancer: a registered pair of range scans, and spine and rig of some frames."""
     pair = np.load(data / "range_pairs" / "samba_g4_f16.npz")
     source, target = (
         tr.RangeScan(torch.from_numpy(pair[f"{name}_points"]).float(), torch.from_numpy(pair[f"{name}_faces"]).long())
@@ -192,7 +200,8 @@ def draw_captured(folder, data):
     meshes = [tr.TriangleMesh(torch.from_numpy(vertices).float(), faces) for vertices in samba["vertices"][::6]]
     view = _upright(torch.cat([mesh.vertices for mesh in meshes]))
     spine_row(folder / "dancer_spine.png", tr.extract_spine(meshes), meshes, view=view)
-    return f"median distance {float(found.distances.median() / source.diagonal):.2%} of the diagonal"
+    rig = rig_movie(folder / "dancer_rig.gif", tr.rig_sequence(meshes), meshes, up=(0.0, 1.0, 0.0))
+    return f"median distance {float(found.distances.median() / source.diagonal):.2%} of the diagonal; rig: {rig}"
 
 
 def _upright(points):

@@ -12,12 +12,13 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.rigging.conftest import arm, frames, rig  # noqa: F401
 from torchreg.io.gltf_file.morph import save_vertex_animation
 from torchreg.io.gltf_write import save_animated_parts
 from torchreg.viz import gltf, pose_editor, scan_gltf, spine_gltf
 
 WEB = Path(__file__).parents[1] / "web"
-KINDS = ("track", "registration", "poses", "sequence", "spine", "vertices")
+KINDS = ("track", "registration", "poses", "sequence", "spine", "vertices", "rig")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def node():
 
 @pytest.fixture(scope="module")
 @torch.no_grad()
-def files(tmp_path_factory, tools, plain_hand, coarse, bend, registration, spine):
+def files(tmp_path_factory, tools, plain_hand, coarse, bend, registration, spine, rig):  # noqa: F811
     """Return by kind: the file, times in it, and where torchreg has the vertices at these times."""
     place, found, ends = tmp_path_factory.mktemp("gltf"), {}, torch.tensor([0.0, 1.0])
     times = torch.tensor([0.0, 0.25, 0.5, 1.0])
@@ -64,10 +65,11 @@ def files(tmp_path_factory, tools, plain_hand, coarse, bend, registration, spine
     ball, shift = tools.ball(2), torch.tensor([0.0, 0.0, 0.4])
     path = spine_gltf.save_spine_animation(place / "spine.glb", spine.model, ball, fps=0.5)
     found["spine"] = path, 4 * ends, torch.stack([ball.vertices, ball.vertices + shift])
-    frames = torch.stack([points, registration.deformed, points + 0.1])
-    path = save_vertex_animation(place / "vertices.glb", frames, faces, torch.arange(3.0))
-    morphed = torch.stack([frames[0], frames[:2].mean(0), *frames[1:]])
+    keyed = torch.stack([points, registration.deformed, points + 0.1])
+    path = save_vertex_animation(place / "vertices.glb", keyed, faces, torch.arange(3.0))
+    morphed = torch.stack([keyed[0], keyed[:2].mean(0), *keyed[1:]])
     found["vertices"] = path, torch.tensor([0.0, 0.5, 1.0, 2.0]), morphed
+    found["rig"] = rig.to_gltf(place / "rig.glb", fps=2.0), 0.5 * torch.arange(len(rig.poses)), rig.vertices()
     return found
 
 
@@ -104,9 +106,9 @@ def test_the_validator_finds_nothing(tools, files, node, tmp_path):
 
 def test_a_refitted_rig_passes_and_plays(tools, files, node, tmp_path):
     source, times, _ = files["track"]
-    rig = tr.ArticulatedShape.from_gltf(source).with_bone_coefficients()
-    changes = 0.05 * torch.randn(len(rig.coefficient_names), generator=torch.Generator().manual_seed(0))
-    path = rig.with_coefficients(changes).to_gltf(tmp_path / "grown.glb", source)
+    refitted = tr.ArticulatedShape.from_gltf(source).with_bone_coefficients()
+    changes = 0.05 * torch.randn(len(refitted.coefficient_names), generator=torch.Generator().manual_seed(0))
+    path = refitted.with_coefficients(changes).to_gltf(tmp_path / "grown.glb", source)
     issues = json.loads(node("validate_gltf.cjs", path))
     assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
     player = tools.play(path)
