@@ -23,6 +23,7 @@ class FitNumbers:
     wide: tuple[float, ...] = (0.04, 0.03, 0.02, 0.01)  # of the thing's size: steps from a neighboring frame's pose
     left: float = 2.0  # last steps of an axis that it is from its end: each is about two thirds of the one before
     damping: float = 1e-3  # of the mean curvature of a part's motion, for what the data do not hold
+    rounding: float = 1e-8  # the same for covariances: damping is no datum, and against rounding alone this is enough
 
 
 FIT = FitNumbers()
@@ -113,8 +114,8 @@ class _System:
     hold: Tensor  # (S,)
 
     @classmethod
-    def of(cls, data: Data, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
-        """Return the system of the normal equations of all parts at a robust scale."""
+    def of(cls, data: Data, mechanism: Mechanism, label: Tensor, scale: float, damping: float) -> _System:
+        """Return the system of the normal equations of all parts at a robust scale, damped by a share of curvature."""
         motions, (frames, size) = mechanism.motions(), mechanism.values.shape
         blocks = data.blocks(motions, label, scale)
         by_value, by_axis = mechanism.jacobians(motions)
@@ -132,13 +133,13 @@ class _System:
             shared = torch.cat([shared, parts.flatten(-2)], -1)
         metric = torch.tensor([1.0] * 3 + [(0.5 * data.size) ** 2] * 3, dtype=torch.float64)
         weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
-        held = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
+        held = blocks.hessian + torch.diag_embed(damping * weight.mean() * metric.expand(frames, size, 6))
         by_step = torch.nn.functional.pad(torch.cat([own, shared], -1), (0, 1, 0, 1))
         by_step[..., -1, -1] = 1
         sums = _summed(by_step, replace(blocks, hessian=held))
         local = sums.diagonal(dim1=-2, dim2=-1)[:, : own.shape[-1]]
         local += 1e-9 * (local + weight.mean())
-        hold = FIT.damping * weight.mean() * metric.repeat(shared.shape[-1] // 6) + 1e-9
+        hold = damping * weight.mean() * metric.repeat(shared.shape[-1] // 6) + 1e-9
         return cls(by_step, sums, own.shape[-1], hold)
 
     def shared(self, sums: Tensor) -> tuple[Tensor, Tensor]:
@@ -190,7 +191,7 @@ def _spread(systems: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
 
 def _step(surfaces: Data, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
     size = mechanism.values.shape[1]
-    system = _System.of(surfaces, mechanism, label, scale)
+    system = _System.of(surfaces, mechanism, label, scale, FIT.damping)
     step = system.shared_steps() if axes else torch.zeros_like(system.hold)
     own = system.own_steps(step)
     return mechanism.stepped(own[:, :6], own[:, 6:], step[: 6 * size].reshape(size, 6))
@@ -204,7 +205,7 @@ def axis_stds(
     ``steps``: (K, 6) last steps of the axes, which are not at their end.
     """
     motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)
-    system = _System.of(surfaces, mechanism, label, scale)
+    system = _System.of(surfaces, mechanism, label, scale, FIT.rounding)
     everything = system.axes_covariance(noise.sigma**2 * noise.repeats, *surfaces.piecewise(motions, label, scale))
     own = everything[: 6 * size, : 6 * size].reshape(size, 6, size, 6)[range(size), :, range(size)]
     own = own + FIT.left**2 * steps.unsqueeze(-1) * steps.unsqueeze(-2)
