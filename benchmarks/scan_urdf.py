@@ -126,7 +126,8 @@ def around(arm: Arm, generator: torch.Generator) -> tuple[Arm, list[tr.RangeScan
     """Return an arm in random poses, and clouds of its whole surface, new points in each, without normals."""
     values = RANGE * (2 * torch.rand(len(arm.poses), arm.poses.shape[1] - 6, generator=generator).double() - 1)
     if isinstance(arm.tree, tr.ArticulatedShape):
-        lower, upper = arm.tree.lower[6:], arm.tree.upper[6:]
+        # Half turns are the limits of joints that have none.
+        lower, upper = arm.tree.lower[6:].clamp_min(-math.pi), arm.tree.upper[6:].clamp_max(math.pi)
         middle = arm.tree.rest[6:].maximum(lower + RANGE).minimum((upper - RANGE).maximum((lower + upper) / 2))
         values = (middle + values).maximum(lower).minimum(upper)
     arm = replace(arm, poses=torch.nn.functional.pad(values, (6, 0)))
