@@ -12,6 +12,7 @@ reference, moved by the file's own joints, lie from where they truly are, as med
     python benchmarks/scan_urdf.py --fused --robot ROBOT.urdf     # a robot of a file, in random steps
     python benchmarks/scan_urdf.py --around                       # 5,000 points all around, no normals, any order
     python benchmarks/scan_urdf.py --around --robot A.urdf B.urdf # robots of files, in random poses within limits
+    python benchmarks/scan_urdf.py --around --robot strangers     # those of example-robot-data, or of --robots FOLDER
     python benchmarks/scan_urdf.py --data FOLDER                  # a hexapod's ten clouds, against its official URDF
 """
 
@@ -27,7 +28,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scan_robots import camera_frame
+from public_shapes import robots_folder
+from scan_robots import ROBOTS, camera_frame
 from scipy.optimize import least_squares, linear_sum_assignment
 from torch import Tensor
 
@@ -44,6 +46,10 @@ from torchreg.shapes.robots import solid_mesh
 STEP, SPLITS = 0.25, 3
 # Of clouds all around: points each, and joint angles at random up to so much, radians.
 POINTS, RANGE = 5000, 0.8
+# Robots of others that nothing was developed on: two arms, two quadrupeds, a hand.
+STRANGERS = {name: ROBOTS[name] for name in ("UR5", "Panda", "A1", "Allegro")} | {
+    "solo12": "solo_description/robots/solo12.urdf"
+}
 # A joint is right within so many degrees, and so much of the size; of the hexapod so many meters.
 DEGREES, SHARE, METERS = 5.0, 0.02, 0.010
 
@@ -120,7 +126,8 @@ def around(arm: Arm, generator: torch.Generator) -> tuple[Arm, list[tr.RangeScan
     """Return an arm in random poses, and clouds of its whole surface, new points in each, without normals."""
     values = RANGE * (2 * torch.rand(len(arm.poses), arm.poses.shape[1] - 6, generator=generator).double() - 1)
     if isinstance(arm.tree, tr.ArticulatedShape):
-        lower, upper = arm.tree.lower[6:], arm.tree.upper[6:]
+        # Half turns are the limits of joints that have none.
+        lower, upper = arm.tree.lower[6:].clamp_min(-math.pi), arm.tree.upper[6:].clamp_max(math.pi)
         middle = arm.tree.rest[6:].maximum(lower + RANGE).minimum((upper - RANGE).maximum((lower + upper) / 2))
         values = (middle + values).maximum(lower).minimum(upper)
     arm = replace(arm, poses=torch.nn.functional.pad(values, (6, 0)))
@@ -160,11 +167,21 @@ def scattered(mesh: tr.TriangleMesh, count: int, generator: torch.Generator) -> 
     return (shares.unsqueeze(-1) * chosen).sum(1) / shares.sum(-1, keepdim=True)
 
 
-def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int, list[float]]:
-    """Print the figures of an arm in clouds all around.
+@dataclass(frozen=True)
+class Score:
+    """How many joints are right, of how many; how many found ones are wrong but sure; and errors in stds.
 
-    Returns how many joints are right, how many there are, and the errors of the right ones' directions in stds.
+    ``errors``: (2, R) of the right ones' directions and places.
     """
+
+    right: int
+    joints: int
+    sure: int
+    errors: Tensor
+
+
+def show_around(arm: Arm, name: str, seed: int) -> Score:
+    """Print and return the figures of an arm in clouds all around."""
     arm, scans = around(arm, torch.Generator().manual_seed(seed))
     begin = time.process_time()
     found = tr.register_sequence(scans, reference="auto")
@@ -175,7 +192,7 @@ def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int, list[float]]:
     angles, across, nearest = axis_errors(replace(arm, poses=arm.poses[found.reference :]), robot)
     right = (angles < DEGREES) & (across < SHARE * size)
     stds = torch.rad2deg(robot.axis_std)
-    wrong = sorted({n for n in range(len(stds)) if stds[n] < DEGREES} - set(nearest[right].tolist()))
+    wrong = {n for n in range(len(stds)) if stds[n] < DEGREES} - set(nearest[right].tolist())
     print(
         f"{name}: {int(right.sum())} of {len(right)} joints right, {len(stds)} found, axes off "
         f"{', '.join(f'{a:.2f}' for a in angles.tolist())} degrees, "
@@ -184,7 +201,14 @@ def show_around(arm: Arm, name: str, seed: int) -> tuple[int, int, list[float]]:
         f"{found.status}, {spent:.0f} CPU s",
         flush=True,
     )
-    return int(right.sum()), len(right), (angles / stds[nearest])[right].tolist()
+    errors = torch.stack([angles / stds[nearest], across / robot.origin_std[nearest]])[:, right]
+    return Score(int(right.sum()), len(right), len(wrong), errors)
+
+
+def robot_files(names: list[str], folder: Path | None) -> list[Path]:
+    """Return the files of robots: of names in `STRANGERS`, of all of these for "strangers", or files themselves."""
+    chosen = [own for name in names for own in (STRANGERS if name == "strangers" else [name])]
+    return [folder / STRANGERS[name] if folder and name in STRANGERS else Path(name) for name in chosen]
 
 
 def show_hexapod(folder: Path, generator: torch.Generator | None) -> None:
@@ -347,7 +371,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=10, help="per arm")
     parser.add_argument("--joints", type=int, nargs="+", default=[3, 5, 7], help="of the arms")
     parser.add_argument("--fused", action="store_true", help="clouds of four depth cameras instead of whole surfaces")
-    parser.add_argument("--robot", type=Path, nargs="+", help="URDF files of robots to scan instead of made-up arms")
+    parser.add_argument(
+        "--robot", nargs="+", help=f"URDF files to scan instead of made-up arms; or strangers: {', '.join(STRANGERS)}"
+    )
+    parser.add_argument("--robots", type=Path, default=robots_folder(), help="where example-robot-data's robots are")
     parser.add_argument(
         "--around", action="store_true", help="clouds of the whole surface, without normals, in any order"
     )
@@ -355,32 +382,31 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--shuffled", action="store_true", help="the hexapod's clouds in a random order")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of a robot's steps")
     options = parser.parse_args(arguments)
+    files = robot_files(options.robot or [], options.robots)
     if options.data:
         for seed in options.seeds:
             show_hexapod(options.data, torch.Generator().manual_seed(seed) if options.shuffled else None)
         return 0
     if options.around:
-        counts = []
+        scores = []
         for seed in options.seeds:
-            for path in options.robot or ():
-                arm = Arm.of_file(path, options.frames, seed)
-                counts.append(show_around(arm, f"{path.stem}, seed {seed}", seed))
-            for joints in () if options.robot else options.joints:
-                arm = Arm.drawn(joints, options.frames, seed=seed + joints)
-                counts.append(show_around(arm, f"{joints} joints, seed {seed}", seed))
-        errors = torch.tensor([error for *_, errors in counts for error in errors])
+            arms = [(path.stem, Arm.of_file(path, options.frames, seed)) for path in files] or [
+                (f"{count} joints", Arm.drawn(count, options.frames, seed=seed + count)) for count in options.joints
+            ]
+            scores += [show_around(arm, f"{name}, seed {seed}", seed) for name, arm in arms]
+        errors = torch.cat([score.errors for score in scores], 1)
+        (direction, place), (most, farthest) = errors.quantile(torch.tensor([0.5, 0.95]).double(), dim=1)
         print(
-            f"{sum(row[0] for row in counts)} of {sum(row[1] for row in counts)} joints right, their directions off by "
-            f"{errors.quantile(0.5):.1f} stds in the median, {errors.quantile(0.95):.1f} in 95 of 100"
+            f"{sum(score.right for score in scores)} of {sum(score.joints for score in scores)} joints right, "
+            f"{sum(score.sure for score in scores)} wrong ones below {DEGREES:.0f} degrees; directions off by "
+            f"{direction:.1f} stds in the median, {most:.1f} in 95 of 100, places by {place:.1f} and {farthest:.1f}"
         )
         return 0
-    if options.robot:
-        for path in options.robot:
-            for seed in options.seeds:
-                arm = Arm.of_file(path, options.frames, seed)
-                show(arm, f"{path.stem}, seed {seed}, {options.frames} frames", options.fused)
-        return 0
-    for joints in options.joints:
+    for path in files:
+        for seed in options.seeds:
+            arm = Arm.of_file(path, options.frames, seed)
+            show(arm, f"{path.stem}, seed {seed}, {options.frames} frames", options.fused)
+    for joints in () if files else options.joints:
         show(Arm.drawn(joints, options.frames, seed=joints), f"{joints} joints, {options.frames} frames", options.fused)
     return 0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from torchreg.geometry.rigid import adjoint, se3_exp
 from torchreg.geometry.rotation import skew
 from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
+from torchreg.solvers.arrow import shared_information
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class FitNumbers:
     wide: tuple[float, ...] = (0.04, 0.03, 0.02, 0.01)  # of the thing's size: steps from a neighboring frame's pose
     left: float = 2.0  # last steps of an axis that it is from its end: each is about two thirds of the one before
     damping: float = 1e-3  # of the mean curvature of a part's motion, for what the data do not hold
+    rounding: float = 1e-8  # the same for covariances: damping is no datum, and against rounding alone this is enough
 
 
 FIT = FitNumbers()
@@ -100,52 +101,21 @@ def fitted(
     return mechanism
 
 
-class _Sums(NamedTuple):
-    """Gauss-Newton system of all frames: steps of each frame, D = 6 + K numbers, and of the axes, 6 K in all."""
-
-    local: Tensor
-    local_gradient: Tensor
-    mixed: Tensor
-    outer: Tensor  # (T, 6 K, 6 K)
-    outer_gradient: Tensor  # (T, 6 K)
-
-    @classmethod
-    def of(cls, own: Tensor, shared: Tensor, hessian: Tensor, gradient: Tensor) -> _Sums:
-        """Return the sums over parts (T, K, 6, ...) that steps of frames and axes move by (..., D) and (..., 6 K)."""
-        return cls(
-            local=(own.mT @ hessian @ own).sum(1),
-            local_gradient=(own.mT @ gradient.unsqueeze(-1)).sum(1).squeeze(-1),
-            mixed=(own.mT @ hessian @ shared).sum(1),
-            outer=(shared.mT @ hessian @ shared).sum(1),
-            outer_gradient=(shared.mT @ gradient.unsqueeze(-1)).sum(1).squeeze(-1),
-        )
-
-    def without(self, piece: _Sums) -> _Sums:
-        """Return what is left of the sums without some of their terms."""
-        return _Sums(*(whole - part for whole, part in zip(self, piece, strict=True)))
-
-    def eliminated(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the frames' solutions (T, D, 6 K + 1), and their shares of the system of the axes (Schur complement).
-
-        These are matrices (T, 6 K, 6 K) and gradients (T, 6 K).
-        """
-        solved = torch.linalg.solve(self.local, torch.cat([self.mixed, self.local_gradient.unsqueeze(-1)], -1))
-        gradient = self.outer_gradient - (self.mixed.mT @ solved[..., -1:]).squeeze(-1)
-        return solved, self.outer - self.mixed.mT @ solved[..., :-1], gradient
-
-
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The system of all parts, and what it is made of."""
+    """Gauss-Newton system of all frames: steps of each frame, D = 6 + K numbers, then the S of what all frames share.
 
-    own: Tensor  # (T, K, 6, D) the parts' twists by steps of their frames
-    shared: Tensor  # (T, K, 6, 6 K) by steps of the axes, (T, K, 6, 12 K) with those of the parts, made of all scans
-    sums: _Sums
-    hold: Tensor
+    These are steps of the axes, 6 K, in scans that are compared with each other then those of the parts, made of all.
+    """
+
+    by_step: Tensor  # (T, K, 7, D + S + 1) the parts' twists by steps; the last row and column are the gradient's
+    sums: Tensor  # (T, D + S + 1, D + S + 1) the Hessian, and the gradient as its last row and column
+    own: int  # D
+    hold: Tensor  # (S,)
 
     @classmethod
-    def of(cls, data: Data, mechanism: Mechanism, label: Tensor, scale: float) -> _System:
-        """Return the system of the normal equations of all parts at a robust scale."""
+    def of(cls, data: Data, mechanism: Mechanism, label: Tensor, scale: float, damping: float) -> _System:
+        """Return the system of the normal equations of all parts at a robust scale, damped by a share of curvature."""
         motions, (frames, size) = mechanism.motions(), mechanism.values.shape
         blocks = data.blocks(motions, label, scale)
         by_value, by_axis = mechanism.jacobians(motions)
@@ -163,33 +133,52 @@ class _System:
             shared = torch.cat([shared, parts.flatten(-2)], -1)
         metric = torch.tensor([1.0] * 3 + [(0.5 * data.size) ** 2] * 3, dtype=torch.float64)
         weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
-        hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
-        sums = _Sums.of(own, shared, hessian, blocks.gradient)
-        local = sums.local + 1e-9 * torch.diag_embed(sums.local.diagonal(dim1=-2, dim2=-1) + weight.mean())
-        hold = FIT.damping * weight.mean() * metric.repeat(shared.shape[-1] // 6) + 1e-9
-        return cls(own, shared, sums._replace(local=local), hold)
+        held = blocks.hessian + torch.diag_embed(damping * weight.mean() * metric.expand(frames, size, 6))
+        by_step = torch.nn.functional.pad(torch.cat([own, shared], -1), (0, 1, 0, 1))
+        by_step[..., -1, -1] = 1
+        sums = _summed(by_step, replace(blocks, hessian=held))
+        local = sums.diagonal(dim1=-2, dim2=-1)[:, : own.shape[-1]]
+        local += 1e-9 * (local + weight.mean())
+        hold = damping * weight.mean() * metric.repeat(shared.shape[-1] // 6) + 1e-9
+        return cls(by_step, sums, own.shape[-1], hold)
+
+    def shared(self, sums: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what sums of frames tell of what these share: matrices (T, S, S) and gradients (T, S)."""
+        found = shared_information(sums, self.own)
+        return found[..., :-1, :-1], found[..., :-1, -1]
+
+    def shared_steps(self) -> Tensor:
+        """Return the steps (S,) of what all frames share."""
+        matrices, gradients = self.shared(self.sums)
+        return -torch.linalg.solve(matrices.sum(0) + torch.diag(self.hold), gradients.sum(0))
+
+    def own_steps(self, step: Tensor) -> Tensor:
+        """Return the best steps (T, D) of the frames beside one (S,) of what they share."""
+        local, (mixed, gradient) = self.sums[:, : self.own], (slice(self.own, -1), -1)
+        return -torch.linalg.solve(local[..., : self.own], local[..., gradient] + local[..., mixed] @ step)
 
     def axes_covariance(self, variance: float, pieces: Blocks, owner: Tensor) -> Tensor:
-        """Return the covariance (6 K, 6 K) of the axes: of errors of a variance, and of what differs between clusters.
+        """Return the covariance (S, S) of the axes: of errors of a variance, and of what differs between clusters.
 
         What the points of a frame share, or those of a piece (P,) of a link in all frames, the noise of their residuals
         does not show; it shows in how far the axes move when one is left out, here by one step each (the cluster
         jackknife of survey statistics, in two directions: Cameron, Gelbach and Miller 2011).
         """
-        _, matrices, gradients = self.sums.eliminated()
-        everything = matrices.sum(0) + torch.diag(self.hold)
-        without = [
-            (everything - matrix, gradients.sum(0) - gradient)
-            for matrix, gradient in zip(matrices, gradients, strict=True)
-        ]
-        covariance = variance * torch.linalg.pinv(everything, hermitian=True) + _spread(without)
+        hold, (matrices, gradients) = torch.diag(self.hold), self.shared(self.sums)
+        everything, gradient = matrices.sum(0) + hold, gradients.sum(0)
+        frames = _spread([(everything - own, gradient - part) for own, part in zip(matrices, gradients, strict=True)])
         without = []
         for number, link in enumerate(owner.tolist()):
-            own, shared = (values[:, [link]] for values in (self.own, self.shared))
-            piece = _Sums.of(own, shared, pieces.hessian[:, [number]], pieces.gradient[:, [number]])
-            _, matrices, gradients = self.sums.without(piece).eliminated()
-            without.append((matrices.sum(0) + torch.diag(self.hold), gradients.sum(0)))
-        return covariance + _spread(without)
+            matrices, gradients = self.shared(self.sums - _summed(self.by_step[:, [link]], pieces.only(number)))
+            without.append((matrices.sum(0) + hold, gradients.sum(0)))
+        return variance * torch.linalg.pinv(everything, hermitian=True) + frames + _spread(without)
+
+
+def _summed(by_step: Tensor, blocks: Blocks) -> Tensor:
+    """Return the sums (T, N, N) over parts (T, K) that steps move by (T, K, 7, N) of Hessians bordered by gradients."""
+    bordered = torch.nn.functional.pad(blocks.hessian, (0, 1, 0, 1))
+    bordered[..., :6, 6] = bordered[..., 6, :6] = blocks.gradient
+    return by_step.flatten(1, 2).mT @ (bordered @ by_step).flatten(1, 2)
 
 
 def _spread(systems: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
@@ -202,14 +191,10 @@ def _spread(systems: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
 
 def _step(surfaces: Data, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
     size = mechanism.values.shape[1]
-    system = _System.of(surfaces, mechanism, label, scale)
-    if not axes:
-        step = -torch.linalg.solve(system.sums.local, system.sums.local_gradient)
-        return mechanism.stepped(step[:, :6], step[:, 6:], torch.zeros(size, 6).double())
-    solved, reduced, gradient = system.sums.eliminated()
-    step = -torch.linalg.solve(reduced.sum(0) + torch.diag(system.hold), gradient.sum(0))
-    own_step = -(solved[..., -1] + solved[..., :-1] @ step)
-    return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step[: 6 * size].reshape(size, 6))
+    system = _System.of(surfaces, mechanism, label, scale, FIT.damping)
+    step = system.shared_steps() if axes else torch.zeros_like(system.hold)
+    own = system.own_steps(step)
+    return mechanism.stepped(own[:, :6], own[:, 6:], step[: 6 * size].reshape(size, 6))
 
 
 def axis_stds(
@@ -220,7 +205,7 @@ def axis_stds(
     ``steps``: (K, 6) last steps of the axes, which are not at their end.
     """
     motions, scale, size = mechanism.motions(), FIT.scales[-1] * noise.sigma, len(points)
-    system = _System.of(surfaces, mechanism, label, scale)
+    system = _System.of(surfaces, mechanism, label, scale, FIT.rounding)
     everything = system.axes_covariance(noise.sigma**2 * noise.repeats, *surfaces.piecewise(motions, label, scale))
     own = everything[: 6 * size, : 6 * size].reshape(size, 6, size, 6)[range(size), :, range(size)]
     own = own + FIT.left**2 * steps.unsqueeze(-1) * steps.unsqueeze(-2)

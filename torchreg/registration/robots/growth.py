@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,10 +10,9 @@ from torch import Tensor
 
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.neighbors import NeighborTree
-from torchreg.geometry.rigid import invert_rigid, rigid_matrix, se3_exp, transform_points
-from torchreg.registration.robots.joints import relative, shared_hinge
-from torchreg.registration.robots.pieces import PIECES, Piece, rotations_and_hinge
-from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces
+from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
+from torchreg.registration.robots.pieces import Piece, rotations_and_hinge
+from torchreg.registration.robots.surfaces import Surfaces
 
 
 @dataclass(frozen=True)
@@ -33,9 +31,7 @@ class GrowthNumbers:
     most: int = 40  # links
     root: tuple[float, ...] = (8.0, 6.0, 4.0, 3.0, 2.0, 1.0, 1.0)  # kernels by which the first link is fitted
     others: tuple[float, ...] = (2.0, 1.0, 1.0)  # and all others
-    wide: tuple[float, ...] = (4.0, 3.0, 2.0, 1.0, 1.0)  # and from turns ten degrees apart
-    turns: int = 2  # best of these, that are refined
-    noise: float = 0.3  # standard deviation of a residual
+    fits: int = 2  # of each to what it explains
 
 
 GROWTH = GrowthNumbers()
@@ -106,36 +102,18 @@ class Growth:
         best, label = (0.5 * (costs + around / degree.unsqueeze(1))).min(-1)
         return replace(self, label=torch.where(best < GROWTH.explained, label, -1))
 
-    def with_link(self, motion: Tensor, parent: int) -> Growth:
-        """Return the links and one more, by its motions (T, 4, 4), unless it explains next to nothing.
-
-        Where a hinge on its parent fits the motions of most scans, turns about it are tried in all.
-        """
+    def with_link(self, motion: Tensor) -> Growth:
+        """Return the links and one more, by its motions (T, 4, 4), unless it explains next to nothing."""
         grown, number, new = self, self.motions.shape[1], motion.unsqueeze(1)
-        for turns in (False, False, True, True):
+        for _ in range(GROWTH.fits):
             grown = replace(self, motions=torch.cat([self.motions, new], 1)).labeled()
             own = (grown.label == number).nonzero()[:, 0]
             if len(own) < GROWTH.least:
                 return self
-            tried = [new, grown._fitted(new, own, GROWTH.others)]
-            if turns:
-                tried += [grown._fitted(start, own, GROWTH.wide) for start in grown._turned(parent, own)]
-            motions = torch.cat(tried, 1)
+            motions = torch.cat([new, grown._fitted(new, own, GROWTH.others)], 1)
             best = grown._frame_costs(motions, own).mean(-1).argmin(1)
             new = motions[torch.arange(len(motions)), best].unsqueeze(1)
         return replace(self, motions=torch.cat([self.motions, new], 1)).labeled()
-
-    def _turned(self, parent: int, own: Tensor) -> list[Tensor]:
-        """Return the best turns (T, 1, 4, 4) of the last link's samples (k,) about the hinge of most of its motions."""
-        pair, sigma = [parent, self.motions.shape[1] - 1], GROWTH.noise * self.surfaces.spacing
-        label = self.label.clamp_min(0)
-        blocks = self.surfaces.blocks(self.motions, label, NUMBERS.cut * sigma)
-        data = relative(self.motions, blocks, (pair[0], pair[1]), Noise(sigma, 1.0), self.surfaces.size)
-        axis = data.in_space(shared_hinge(data)[1])
-        angles = torch.arange(PIECES.turns, dtype=torch.float64) * (math.tau / PIECES.turns)
-        turns = self.motions[:, [parent]] @ se3_exp(angles.unsqueeze(-1) * axis)
-        best = self._frame_costs(turns, own).mean(-1).topk(GROWTH.turns, 1, largest=False).indices
-        return [turns[torch.arange(len(turns)), column].unsqueeze(1) for column in best.mT]
 
     def fronts(self) -> list[Front]:
         """Return the borders of links and of connected samples that none explains."""
@@ -201,19 +179,19 @@ def grown(state: Growth) -> tuple[Tensor, Tensor]:
     """
     failed = set[tuple[int, ...]]()
     while state.motions.shape[1] < GROWTH.most:
-        clouds, best = state.open_clouds(), dict[int, tuple[float, Tensor, int]]()
+        clouds, best = state.open_clouds(), dict[int, tuple[float, Tensor]]()
         for front in state.fronts():
             if front.key in failed:
                 continue
-            found = *state.searched(front, clouds), front.link
+            found = state.searched(front, clouds)
             if found[0] < GROWTH.least:
                 failed.add(front.key)
             else:
                 piece = int(front.open[0])
                 best[piece] = max(best.get(piece, found), found, key=lambda row: row[0])
         before = state.motions.shape[1]
-        for _, motion, parent in best.values():
-            state = state.with_link(motion, parent)
+        for _, motion in best.values():
+            state = state.with_link(motion)
         if state.motions.shape[1] == before:
             break
     known = state.label >= 0

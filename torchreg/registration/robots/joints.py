@@ -124,7 +124,7 @@ def best_joint(data: Relative) -> Candidate:
 
     if min(map(length, found)) > 0 and frames >= JOINTS.universal:
         found["universal"] = _fitted(data, _crosses(data), _two_angles(data))
-        found["outlier"] = shared_hinge(data)
+        found["outlier"] = _shared_hinge(data)
     kind = min(found, key=length)
     (_, axes, values), size = found[kind], length(kind)
     kind = "revolute" if kind == "outlier" else kind
@@ -133,7 +133,7 @@ def best_joint(data: Relative) -> Candidate:
     return Candidate(kind, data.in_space(axes), values, size)
 
 
-def shared_hinge(data: Relative) -> tuple[float, Tensor, Tensor]:
+def _shared_hinge(data: Relative) -> tuple[float, Tensor, Tensor]:
     """Return the cost of one hinge, its axis (1, 6) and values (T, 1), where motions of some frames may be wrong.
 
     Of the axes of single frames that which most frames agree with, fitted to the half of them that it fits best, then

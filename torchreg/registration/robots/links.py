@@ -28,23 +28,22 @@ class LinkNumbers:
 LINKS = LinkNumbers()
 
 
-def labeled(
-    surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, free: float, asked: Tensor | None = None
-) -> Tensor:
+def labeled(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, asked: Tensor | None = None) -> Tensor:
     """Return the labels (n,) of least description length under given motions (T, K, 4, 4).
 
     A sample costs half its squared residual in standard deviations, up to that of an outlier, summed over the frames; a
-    border between neighbors costs what its rarity tells (`border_cost`); a label that is used costs its parameters,
-    half the logarithm of the number of residuals each. Samples that err together count once; a motion that a sample is
-    not ``asked`` about (n, K) is wrong for it (Isack and Boykov 2012 (PEARL); Delong et al. 2012; Schwarz 1978 for the
-    cost of parameters).
+    border between neighbors costs what its rarity tells (`border_cost`); a label that is used costs the parameters of
+    a hinge, its axis and a value a frame, half the logarithm of the number of residuals each: links hang on joints, and
+    at the cost of free motions short ones between two hinges would be their neighbors'. Samples that err together count
+    once; a motion that a sample is not ``asked`` about (n, K) is wrong for it (Isack and Boykov 2012 (PEARL); Delong et
+    al. 2012; Schwarz 1978 for the cost of parameters).
     """
     asked = torch.ones(len(label), motions.shape[1], dtype=torch.bool) if asked is None else asked
     squares = surfaces.squares(motions, NUMBERS.cut * noise.sigma, asked) / noise.sigma**2
     unary = 0.5 * squares.clamp_max(NUMBERS.cut**2).sum(0) / noise.repeats
     count = len(surfaces.targets) * len(surfaces.samples) / noise.repeats
     weights = unary.new_full((len(surfaces.edges),), border_cost(surfaces.edges, label))
-    costs = unary.new_full((motions.shape[1],), 0.5 * free * math.log(max(count, 2.0)))
+    costs = unary.new_full((motions.shape[1],), 0.5 * (len(squares) + 4.0) * math.log(max(count, 2.0)))
     return alpha_expansion(unary, surfaces.edges, weights, label_costs=costs, initial=label).labels
 
 
@@ -63,7 +62,6 @@ def without_gaps(motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
 
 def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor, Noise]:
     """Return motions (T, K, 4, 4) and labels (n,) of links, and the noise: proposals, labels and motions in turn."""
-    free = 6.0 * len(surfaces.targets)
     for number in range(LINKS.rounds):
         before, noise = label, surfaces.noise(motions, label)
         scales = [scale * noise.sigma for scale in LINKS.scales]
@@ -74,7 +72,7 @@ def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tens
             proposals = torch.cat([motions, pieces], 1)
             asked = torch.cat([torch.ones(len(label), motions.shape[1], dtype=torch.bool), near], 1)
         noise = surfaces.noise(motions, label)
-        motions, label = without_gaps(proposals, labeled(surfaces, proposals, label, noise, free, asked))
+        motions, label = without_gaps(proposals, labeled(surfaces, proposals, label, noise, asked))
         if number >= LINKS.splits and torch.equal(before, label):
             break
     return motions, label, noise

@@ -134,7 +134,7 @@ def find_robot(
         mechanism = settled(surfaces, mechanism, label, noise)
         motions = mechanism.motions()
     noise = surfaces.noise(motions, label)
-    label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
+    label = labeled(surfaces, motions, label, noise)
     fit: tuple[Data, Mechanism, Noise, Tensor] = surfaces, mechanism, noise, torch.zeros_like(mechanism.axes)
     if sparse:
         fit = compared_with_each_other(scans, surfaces, mechanism.with_frame(reference), label, reference)

@@ -87,6 +87,11 @@ class Blocks:
         """Return the equations of the sums (T, K, 43) of `frame_sums` in T frames about the centers (T, K, 3)."""
         return cls(sums[..., :36].unflatten(-1, (6, 6)), sums[..., 36:42], centers, sums[..., 42])
 
+    def only(self, part: int) -> Blocks:
+        """Return the equations of one part."""
+        chosen = (values[:, [part]] for values in (self.hessian, self.gradient, self.centers, self.count))
+        return Blocks(*chosen)
+
     def joined(self, owner: Tensor, centers: Tensor) -> Blocks:
         """Return the equations of links (K,), about their centers, whose pieces' these are: piece p is of owner[p]."""
 
