@@ -49,7 +49,7 @@ class PresenceModel(Logistic):
 
     ``e`` are the `unseen_share` and the relative noise: background suits a part of the shape only, and another thing
     not exactly. How well the data determine the pose does not matter. Fitted to 165 searches for a hand or a robot arm
-    among tubes, walls and points in the air; 77 show it, some with up to 70 % cut off, 17 of the others another thing.
+    among tubes, walls and points in the air: 77 show it, some with up to a third cut off, and 13 show the other one.
     """
 
     bias: float = 5.59
