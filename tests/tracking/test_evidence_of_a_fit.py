@@ -7,8 +7,11 @@ import torch
 
 import torchreg as tr
 from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.limbs import find_limbs
 from torchreg.tracking import unexplained
+from torchreg.tracking.evidence import presence, unseen_share
+from torchreg.tracking.frame import Frame
 
 CELL = 0.01
 
@@ -120,3 +123,37 @@ def test_unexplained_clusters_are_as_dense_as_the_surface(plain_hand_skin):
     assert len(found) >= 28
     assert float(torch.cdist(found, patch).amin(-1).max()) < 1e-3
     assert len(clusters.find(data, data[:, 2], torch.tensor(9.0))) == 0
+
+
+def shown(arm, skin, cloud, pose):
+    """Return the unseen share and the presence of an arm that was found at a pose in a cloud."""
+    made = tr.Tracker(arm, model_points=skin)
+    frame = Frame(cloud=cloud, finite=torch.ones(len(cloud), dtype=torch.bool), elapsed=1.0)
+    fit = made._fitter.fit_at(made.state, frame, pose, "found")
+    return float(unseen_share(fit)), presence(fit)
+
+
+def test_presence_counts_the_surface_that_faces_the_data_and_has_none(arm, tracking):
+    """Half of a cloud hides what lies there, one side of it nothing; wherever it lies, and whatever it is turned to."""
+    pose, skin, elbow = tracking.pose, tracking.skin, torch.linalg.inv(arm.part_transforms(tracking.pose)[1])
+    mesh, toward = arm.surface_mesh(pose, spacing=0.01), torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    whole, sure = shown(arm, skin, mesh.vertices, pose)
+    assert whole == 0.0
+    assert sure > 0.9
+    normals = mesh.vertex_normals()
+    cloud = mesh.vertices[normals @ toward > 0.2]
+    side, facing = shown(arm, skin, cloud, pose)
+    assert side < 0.05
+    assert facing > 0.9
+    # Of the arm, what is farther out than the middle of its ellipsoid is missing.
+    cut = cloud[transform_points(elbow, cloud)[:, 0] < 0.15]
+    half, unsure = shown(arm, skin, cut, pose)
+    model = skin(pose)
+    faces = normals[torch.cdist(model, mesh.vertices).argmin(-1)] @ toward > 0.3
+    expected = (torch.cdist(model[faces], cut).amin(-1) > 0.02).double().mean()
+    assert half == pytest.approx(float(expected), abs=0.1)
+    assert half > 0.15
+    assert unsure < facing
+    turn = so3_exp(torch.tensor([0.3, -0.9, 0.4], dtype=torch.float64))
+    moved = torch.cat([turn @ pose[:3] + 0.7, so3_log(turn @ so3_exp(pose[3:6])), pose[6:]])
+    assert shown(arm, skin, cut @ turn.mT + 0.7, moved) == pytest.approx((half, unsure), abs=0.02)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION, confidence_of
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
@@ -20,7 +19,7 @@ from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.pose_algebra import difference, shifted
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.tracking.evidence import is_doubtful, is_supported, residual_too_large
+from torchreg.tracking.evidence import PRESENCE, is_doubtful, is_supported, presence, residual_too_large
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.motion_model import uncertainty_growth
@@ -42,11 +41,6 @@ class RecoveryPlan:
     max_repetitions: int = 3  # of the first search everywhere, with other draws: nothing is known yet
     more_candidates: int = 2  # of a repetition, in those of the first search
     new_share: float = 0.02  # of the data that is new: something has come that may be the shape
-    # Confidence of a search everywhere in data that show the shape: of made-up hands with a forearm and a wall it is
-    # .27 to .69 in 18 of 19 frames, and .01 to .12 where the hand is left out.
-    min_confidence: float = 0.2
-    # The same where other poses that explain the data as well do not count: a symmetric shape has such, and fits.
-    symmetric_confidence: float = 0.95
 
 
 _PLAN = RecoveryPlan()
@@ -87,12 +81,11 @@ class Recovery:
         return fit, replace(state, pending_checks=0)
 
     def everywhere(self, state: TrackState, frame: Frame, repetitions: int = _PLAN.max_repetitions) -> FrameFit | None:
-        """Return the fit of a search everywhere, None where the data hardly show the shape.
+        """Return the fit of a search everywhere, None where the data more probably show something else.
 
-        Of equivalent poses after a loss, it is that of the one nearest to the last. Where the data do not lie on the
-        surface of a fit, the first search is repeated with more effort.
+        Where the data do not lie on the surface of a fit, the first search is repeated with more effort.
         """
-        best, confidence = self._find(state, frame, FindPoseConfig(seed=state.seed))
+        best = self._find(state, frame, FindPoseConfig(seed=state.seed))
         for number in range(1, repetitions + 1):
             if state.lost or (best is not None and not residual_too_large(best, state)):
                 break
@@ -101,21 +94,12 @@ class Recovery:
                 num_candidates=_PLAN.more_candidates * FindPoseConfig.num_candidates,
                 num_placed=_PLAN.more_candidates * FindPoseConfig.num_placed,
             )
-            other, sure = self._find(state, frame, config)
-            if best is None or (other is not None and other.soft_inliers > best.soft_inliers):
-                best, confidence = other, sure
-        return best if confidence >= _PLAN.min_confidence or self._is_symmetric(best) else None
+            fits = [fit for fit in (best, self._find(state, frame, config)) if fit is not None]
+            best = max(fits, key=lambda fit: fit.soft_inliers, default=None)
+        return best if best is not None and presence(best) >= PRESENCE.shown else None
 
-    def _is_symmetric(self, fit: FrameFit | None) -> bool:
-        """Return whether data surely show the shape, though perhaps in another of several alike poses."""
-        if fit is None:
-            return False
-        evidence, _ = self.fitter.judged(fit, self.fitter.covariance(fit)[0])
-        calibration = CALIBRATION if fit.person is None else SHAPE_CALIBRATION
-        return float(confidence_of(evidence.table(), calibration)) >= _PLAN.symmetric_confidence
-
-    def _find(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> tuple[FrameFit | None, float]:
-        """Return the fit of a search, and the confidence that the data show the shape there."""
+    def _find(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> FrameFit | None:
+        """Return the fit of a search; of equivalent poses after a loss, that of the one nearest to the last."""
         shape = self.fitter.shape
         data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
         seen = data if frame.picture is None else frame.picture
@@ -128,7 +112,7 @@ class Recovery:
             poses = poses[starts.costs <= starts.costs.min() + _PLAN.equivalent * len(data)]
             distances = (shape.keypoints(poses) - shape.keypoints(state.pose)).norm(dim=-1).mean(-1)
             poses = poses[distances.argsort()]
-        return self.fitter.fit_at(state, frame, poses[0], "found"), float(starts.confidence)
+        return self.fitter.fit_at(state, frame, poses[0], "found")
 
     def _propose(self, state: TrackState, frame: Frame) -> FrameFit | None:
         """Return the best fit from poses that a network proposes for all data, wherever the shape was before."""

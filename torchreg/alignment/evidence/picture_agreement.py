@@ -178,13 +178,9 @@ class _Surface:
     @classmethod
     def of(cls, problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> _Surface:
         """Return what a picture shows where the surface of a pose (1, num_dofs) would be."""
-        posed = problem.skin(pose)
-        normal, posed = _shape_normals(problem, pose, posed)[0], posed[0]
+        posed = problem.skin(pose)[0]
         toward = torch.nn.functional.normalize(frame.camera.position.to(posed) - posed, dim=-1)
-        steps = _LOOK.nearest_ray * 2.0 ** torch.arange(_LOOK.num_rays).to(posed)
-        rays = posed + problem.size * steps[:, None, None] * toward
-        clear = problem.surface.distance(rays.reshape(1, -1, 3), pose).reshape(len(rays), -1) > 0
-        visible = ((normal * toward).sum(-1) > _LOOK.facing) & clear.all(0)
+        visible = visible_points(problem, pose, toward)
         pixels, depth = frame.camera.project(posed)
         column, row = pixels.nan_to_num(-1).round().long().unbind(-1)
         height, width = frame.depth.shape
@@ -211,6 +207,16 @@ class _Surface:
     def share(self, which: Tensor) -> Tensor:
         """Return the share () of the measured points that are some (N,)."""
         return ((which & self.known).sum() / self.known.sum().clamp_min(1)).to(self.gap)
+
+
+def visible_points(problem: AlignProblem, pose: Tensor, toward: Tensor) -> Tensor:
+    """Return which points (N,) of the skin in a pose (1, num_dofs) a camera in directions (N, 3) or (3,) would see."""
+    posed = problem.skin(pose)
+    normal, posed = _shape_normals(problem, pose, posed)[0], posed[0]
+    steps = _LOOK.nearest_ray * 2.0 ** torch.arange(_LOOK.num_rays).to(posed)
+    rays = posed + problem.size * steps[:, None, None] * toward
+    clear = problem.surface.distance(rays.reshape(1, -1, 3), pose).reshape(len(rays), -1) > 0
+    return ((normal * toward).sum(-1) > _LOOK.facing) & clear.all(0)
 
 
 def _shape_normals(problem: AlignProblem, pose: Tensor, points: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -273,12 +272,11 @@ def weigh(
 ) -> Evidence:
     """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,)."""
     noise = surface_noise(distance, problem.valid, problem.size)
-    least = SURFACE_FIT.min_noise(problem.size)
     count = problem.valid.sum(-1).clamp_min(1).to(distance)
     near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
     lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
     return Evidence(
-        noise=(noise / least).log() / math.log(SURFACE_FIT.max_noise(problem.size) / least),
+        noise=SURFACE_FIT.relative_noise(noise, problem.size),
         beside=beside.sqrt(),
         clusters=clustered.sqrt().clamp_max(1),
         off=1 - near / count,

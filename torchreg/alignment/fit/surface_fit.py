@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,6 +39,11 @@ class SurfaceFit:
     def min_noise(self, size: float) -> float:
         """Return the smallest: what a model of some size is not exact, metres."""
         return self.min_width * size / self.width_per_noise
+
+    def relative_noise(self, noise: Tensor, size: float) -> Tensor:
+        """Return where noise (...), metres, lies between the smallest (0) and the largest (1), in logarithms."""
+        least = self.min_noise(size)
+        return (noise / least).log() / math.log(self.max_noise(size) / least)
 
 
 SURFACE_FIT = SurfaceFit()
