@@ -10,13 +10,16 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
 from torchreg.alignment.search.pose_proposer import PoseProposer, ProposerSize, RawPoses, posed_points
+from torchreg.alignment.shape.person_proposer import PersonProposer, RawPeople, is_body
 from torchreg.datasets.cloud_batches import CloudBatch, random_clouds, random_poses
+from torchreg.datasets.people_batches import PeopleBatch, PeopleBatches
 from torchreg.errors import FormatError
 from torchreg.io.limits import local_path
 from torchreg.shapes.articulated import ArticulatedShape
@@ -135,6 +138,55 @@ def train_initializer(
     return PoseProposer.load(path, shape)
 
 
+class Lesson(Protocol):
+    """What a network learns: made-up clouds, and how wrong its proposals are."""
+
+    net: PoseProposer | PersonProposer
+    rest: Tensor
+
+    def clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
+        """Return clouds with their truth, whose index tells of places (N, 3) at `rest`, metres."""
+
+    def errors(self, raw: Any, batch: Any) -> Tensor:
+        """Return the mean distances (B, K) of proposed points from where they are, as a share of the size."""
+
+
+class PoseLesson:
+    """Poses of any shape of solids or a mesh."""
+
+    def __init__(self, shape: ArticulatedShape, size: ProposerSize | None) -> None:
+        self.shape, self.net = shape, PoseProposer(shape, size).to(shape.rest.device)
+        self.skin = sample_skin(shape, _TRAINING.surface_points)
+        self.compared = sample_skin(shape, _TRAINING.compared)
+        self.rest = self.skin.points
+
+    def clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
+        """Return clouds, half of them windows of scenes."""
+        poses = random_poses(self.shape, count, generator)
+        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator, in_scenes=True)
+
+    def errors(self, raw: RawPoses, batch: CloudBatch) -> Tensor:
+        """Return the errors (B, K) of the shape's points."""
+        return pose_errors(raw, batch, self.compared, self.net.shape_size)
+
+
+class PersonLesson:
+    """People of a body with coefficients, of all sizes."""
+
+    def __init__(self, body: ArticulatedShape, size: ProposerSize | None) -> None:
+        self.net = PersonProposer(body, size).to(body.rest.device)
+        self.people = PeopleBatches(body, self.net.marks)
+        self.rest = self.people.rest
+
+    def clouds(self, count: int, generator: torch.Generator) -> PeopleBatch:
+        """Return clouds, bare and clothed."""
+        return self.people.clouds(count, self.net.size.points, generator, self.net.shape_size)
+
+    def errors(self, raw: RawPeople, batch: PeopleBatch) -> Tensor:
+        """Return the errors (B, K) of the marks, as shares of each person's own size."""
+        return (raw.marks - batch.marks.unsqueeze(1)).norm(dim=-1).mean(-1) / batch.sizes.unsqueeze(1)
+
+
 class _Run:
     """The state of a training: network, optimizer, and how far it is."""
 
@@ -143,16 +195,17 @@ class _Run:
     ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.checkpoint, self.curve = config, path.with_suffix(".pt"), path.with_suffix(".jsonl")
-        self.shape, device = shape, shape.rest.device
-        self.net = PoseProposer(shape, size).to(device)
+        device = shape.rest.device
+        self.lesson: Lesson = PersonLesson(shape, size) if is_body(shape) else PoseLesson(shape, size)
+        self.net = self.lesson.net
         self.optimizer = torch.optim.AdamW(self.net.parameters(), lr=config.rate, weight_decay=_TRAINING.decay)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         self.step, self.seconds, self.total = 0, 0.0, torch.zeros((), device=device)
         if self.checkpoint.exists():
             self._resume()
-        self.skin = sample_skin(shape, _TRAINING.surface_points)
-        self.compared = sample_skin(shape, _TRAINING.compared)
-        self.validation = self._clouds(_TRAINING.validation, torch.Generator(device).manual_seed(config.seed + 1))
+        with torch.no_grad():
+            generator = torch.Generator(device).manual_seed(config.seed + 1)
+            self.validation = self.lesson.clouds(_TRAINING.validation, generator)
 
     @property
     def share(self) -> float:
@@ -161,11 +214,13 @@ class _Run:
 
     def advance(self) -> Tensor:
         """Make a step of the optimizer and return the sum of losses since the last validation."""
-        batch = self._clouds(self.config.batch, self.generator)
+        with torch.no_grad():
+            batch = self.lesson.clouds(self.config.batch, self.generator)
         device = batch.points.device.type
         with torch.autocast(device, dtype=torch.bfloat16, enabled=device == "cuda"):
             raw = self.net(batch.points, batch.mask)
-        loss = proposal_loss(raw, batch, self.skin, self.compared, self.net.shape_size, self._width())
+        errors = self.lesson.errors(raw, batch)
+        loss = proposal_loss(raw, batch, errors, self.lesson.rest / self.net.shape_size, self._width())
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate()
         self.optimizer.zero_grad()
@@ -181,7 +236,7 @@ class _Run:
         """Return how the network does on clouds that it is not trained on."""
         self.net.eval()
         raw = self.net(self.validation.points, self.validation.mask)
-        errors = pose_errors(raw, self.validation, self.compared, self.net.shape_size)
+        errors = self.lesson.errors(raw, self.validation)
         self.net.train()
         shown = self.validation.is_shown
         first = errors.gather(1, raw.logits.argmax(1, keepdim=True))[shown].mean()
@@ -217,10 +272,6 @@ class _Run:
         self.step, self.seconds = state["step"], state["seconds"]
         self.generator.set_state(state["generator"].cpu())
 
-    def _clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
-        poses = random_poses(self.shape, count, generator)
-        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator, in_scenes=True)
-
     def _rate(self) -> float:
         """Return the learning rate: a short rise, then half a cosine."""
         rise = min(1.0, (self.step + 1) / _TRAINING.warm_up)
@@ -239,17 +290,19 @@ def pose_errors(raw: RawPoses, batch: CloudBatch, compared: LinearBlendSkin, siz
 
 
 def proposal_loss(
-    raw: RawPoses, batch: CloudBatch, skin: LinearBlendSkin, compared: LinearBlendSkin, size: float, width: float
+    raw: RawPoses | RawPeople, batch: CloudBatch, errors: Tensor, rest: Tensor, width: float
 ) -> Tensor:
-    """Return the loss () of proposals, see `train_initializer`; ``width`` scales the errors, as a share of the size."""
-    errors = pose_errors(raw, batch, compared, size)
+    """Return the loss () of proposals with errors (B, K), see `train_initializer`; ``width`` scales the errors.
+
+    Lengths, those of places (N, 3) at rest too, are shares of the size.
+    """
     likely = torch.logsumexp(raw.logits.log_softmax(-1) - errors / width, dim=-1)
     # In units of the error: the gradient does not grow as the distribution narrows.
     poses = -width * (likely * batch.is_shown).sum() / batch.is_shown.sum().clamp_min(1)
     index = batch.index.gather(1, raw.token_index)
     known = batch.mask.gather(1, raw.token_index)
     inlier = known & (index >= 0)
-    truth = skin.points[index.clamp_min(0)] / size
+    truth = rest[index.clamp_min(0)]
     error = torch.nn.functional.smooth_l1_loss(
         raw.surface[..., :3], truth, reduction="none", beta=_TRAINING.surface_width
     ).sum(-1)
