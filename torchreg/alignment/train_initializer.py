@@ -33,6 +33,7 @@ class _Training:
     surface_points: int = 3000  # of which clouds are drawn
     compared: int = 64  # points by which poses are compared
     width: tuple[float, float] = (0.15, 0.02)  # scale of the errors' distribution, from the first step to the last
+    people_width: tuple[float, float] = (0.05, 0.015)  # the same of people: headings are apart from the start
     surface_weight: float = 1.0  # of what tokens tell, beside the poses
     surface_width: float = 0.05  # error of a token at which its loss turns from squares to absolute values
     warm_up: int = 200  # steps until the full rate
@@ -143,6 +144,7 @@ class Lesson(Protocol):
 
     net: PoseProposer | PersonProposer
     rest: Tensor
+    width: tuple[float, float]
 
     def clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
         """Return clouds with their truth, whose index tells of places (N, 3) at `rest`, metres."""
@@ -153,6 +155,8 @@ class Lesson(Protocol):
 
 class PoseLesson:
     """Poses of any shape of solids or a mesh."""
+
+    width = _TRAINING.width
 
     def __init__(self, shape: ArticulatedShape, size: ProposerSize | None) -> None:
         self.shape, self.net = shape, PoseProposer(shape, size).to(shape.rest.device)
@@ -172,6 +176,8 @@ class PoseLesson:
 
 class PersonLesson:
     """People of a body with coefficients, of all sizes."""
+
+    width = _TRAINING.people_width
 
     def __init__(self, body: ArticulatedShape, size: ProposerSize | None) -> None:
         self.net = PersonProposer(body, size).to(body.rest.device)
@@ -279,7 +285,7 @@ class _Run:
 
     def _width(self) -> float:
         """Return the scale of the errors' distribution, which narrows in the first half of the training."""
-        first, last = map(math.log, _TRAINING.width)
+        first, last = map(math.log, self.lesson.width)
         return math.exp(first + (last - first) * min(1.0, 2 * self.share))
 
 

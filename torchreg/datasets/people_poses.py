@@ -71,8 +71,8 @@ class _Trunk:
     spine: Vector = (10, 8, 12)  # standard deviations: forward, sideward, turn
     head: Vector = (20, 12, 25)
     twist: float = 40  # of a forearm that turns freely
-    tilt: float = 15  # standard deviation from upright
-    leaning: float = 0.25  # of the people, by any angle up to
+    tilt: float = 12  # standard deviation from upright
+    leaning: float = 0.15  # of the people, by any angle up to
     lean: float = 60  # a little more than an axis of a frame is off at most
 
 

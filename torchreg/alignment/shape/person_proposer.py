@@ -2,26 +2,62 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
+from torchreg.alignment.fit.problem import joint_precision
+from torchreg.alignment.search.multi_start import distinct_first
 from torchreg.alignment.search.pose_proposer import CloudNet, ProposerSize
+from torchreg.alignment.search.rough_poses import closeness, two_sided_cost
+from torchreg.alignment.shape.shape_problem import ShapeProblem
+from torchreg.errors import FormatError
+from torchreg.geometry.rigid import fit_rigid, transform_points
+from torchreg.geometry.rotation import rotation_between, so3_exp, so3_log
+from torchreg.geometry.rotation_representations import rotation_from_6d, rotation_to_6d
 from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.upright import Direction
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
+from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.shaped import ShapedSkin, ShapedTree
+from torchreg.shapes.spec import RigSurface
+from torchreg.solvers.e_step import EStep
+
+_KIND = "PersonProposer"
+# Of anny's body, if it comes with this torchreg.
+BODY_WEIGHTS = Path(__file__).with_name("people.safetensors")
 
 
 @dataclass(frozen=True)
 class _Marks:
     """Vertices of the body whose places the network tells."""
 
-    groups: int = 16  # that cover the body, each told by a query of its own
+    groups: int = 16  # that cover the body, whose vertices are told by the same tokens
     each: int = 8  # vertices of a group
 
 
-_MARKS = _Marks()
+@dataclass(frozen=True)
+class _States:
+    """How people are taken from proposed places; lengths are shares of the size."""
+
+    num_data: int = 500  # by which proposals are ranked
+    same: float = 0.05  # proposals whose marks differ by less are one
+    error: float = 0.02  # of a mark
+    joint_std: float = 0.35  # of a joint about rest, radians: marks tell of a limb, not of each of its joints
+    steps: int = 12  # from rest to any pose
+
+
+_MARKS, _STATES = _Marks(), _States()
 PERSON_SIZE = ProposerSize(tokens=96, encoder=3, hypotheses=4)
 
 
@@ -37,51 +73,153 @@ class RawPeople(NamedTuple):
 class PersonProposer(CloudNet):
     """Proposes where marks on a body's surface lie, for people of any size and pose who stand about along z.
 
-    Places rather than angles: they are linear in what is seen, and of clothes and sizes alike.
+    Every token tells how far the marks are from it, in the frame of a hypothesis, and how much that counts for each
+    group of marks. Places rather than angles: they are linear in what is seen, and of all sizes alike.
 
     Args:
         body: with coefficients, in metres.
         size: see `ProposerSize`.
+        marks: (P,) numbers of the vertices, as `spread_marks` gives them, which it does by default.
 
     Shape of ``forward(points, mask)``: as of `PoseProposer`; see `RawPeople`.
 
     Differentiable: in its parameters and the points.
 
-    References: Lin et al. 2021 (METRO), for places of vertices by queries; Carion et al. 2020.
+    References: Qi et al. 2019 (VoteNet), for votes; Carion et al. 2020, for hypotheses.
     """
 
     marks: Tensor
     at_rest: Tensor
+    headings: Tensor
 
-    def __init__(self, body: ArticulatedShape, size: ProposerSize | None = None) -> None:
+    def __init__(
+        self, body: ArticulatedShape, size: ProposerSize | None = None, *, marks: Tensor | None = None
+    ) -> None:
         space = body.coefficient_space()
         at_mean = space.rest(space.mean)[0].detach().float()
         extent = float((at_mean.amax(0) - at_mean.amin(0)).norm())
         super().__init__(size or PERSON_SIZE, extent)
-        width, marks = self.size.width, spread_marks(at_mean)
+        width, self.num_vertices = self.size.width, len(at_mean)
+        marks = spread_marks(at_mean) if marks is None else marks
         self.register_buffer("marks", marks, persistent=False)
         self.register_buffer("at_rest", (at_mean[marks] - at_mean[marks].mean(0)) / extent, persistent=False)
-        self.groups = nn.Parameter(torch.randn(_MARKS.groups, width))
-        last = nn.Linear(width, 3 * _MARKS.each + 1)
-        self.head = nn.Sequential(nn.Linear(width, width), nn.GELU(), last)
+        # Each hypothesis begins with another heading: front and back look much alike, and their mean like neither.
+        angles = torch.arange(self.size.hypotheses) * (math.tau / self.size.hypotheses)
+        headings = so3_exp(angles.unsqueeze(-1) * torch.tensor(body.up))
+        self.register_buffer("headings", rotation_to_6d(headings).to(at_mean), persistent=False)
+        self.told = nn.Linear(width, 7)
+        self.condition = nn.Linear(width, width)
+        last = nn.Linear(width, (3 * _MARKS.each + 1) * _MARKS.groups)
+        self.vote = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU(), last)
         self.surface = nn.Linear(width, 4)
         with torch.no_grad():
-            last.weight.mul_(0.1)
-            last.bias.zero_()
+            for layer in (last, self.told):
+                layer.weight.mul_(0.1)
+                layer.bias.zero_()
 
     def forward(self, points: Tensor, mask: Tensor) -> RawPeople:
         """Return places, see the class."""
-        queries = self.queries.unsqueeze(1) + self.groups
-        found = self.attended(points, mask, queries.flatten(0, 1))
-        out = self.head(found.state).float().unflatten(1, queries.shape[:2])
-        places, logits = out.split((3 * _MARKS.each, 1), dim=-1)
-        places = places.unflatten(-1, (-1, 3)).flatten(2, 3) + self.at_rest
+        found = self.attended(points, mask, self.queries)
+        turn, logits = self.told(found.state).float().split((6, 1), dim=-1)
+        rotation = rotation_from_6d(turn + self.headings)
+        out = self.vote(found.tokens.unsqueeze(1) + self.condition(found.state).unsqueeze(2)).float()
+        known = mask.gather(1, found.token_index)[:, None, :, None]
+        offset, weight = out.split((3 * len(self.marks), _MARKS.groups), dim=-1)
+        weight = weight.masked_fill(~known, -torch.inf).softmax(2).nan_to_num()
+        mean = torch.einsum("bktg,bktgc->bkgc", weight, offset.unflatten(-1, (_MARKS.groups, -1)))
+        mean = mean.unflatten(-1, (-1, 3)).flatten(2, 3) + self.at_rest
+        places = points.gather(1, found.token_index.unsqueeze(-1).expand(-1, -1, 3))
+        base = torch.einsum("bktg,btc->bkgc", weight, places).repeat_interleave(_MARKS.each, 2)
         return RawPeople(
-            marks=self.shape_size * places + found.center[:, None, None],
-            logits=logits.mean((-2, -1)),
+            marks=base + self.shape_size * mean @ rotation.mT,
+            logits=logits.squeeze(-1),
             surface=self.surface(found.tokens).float(),
             token_index=found.token_index,
         )
+
+    @torch.no_grad()
+    def propose(
+        self, problem: ShapeProblem, surface: RigSurface, count: int, generator: torch.Generator,
+        upright: Direction | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Return states (count, D + K) of different people in the one scan of a problem, best first.
+
+        They may stand along any axis of the data's coordinates, or along ``upright`` alone.
+
+        Args:
+            problem: of one row, with the body's tree.
+            surface: of the body.
+            count: of the states.
+            generator: by which data are drawn.
+            upright: direction (3,) that is upright in the data, if that is known.
+        """
+        turns = _turns(problem.skin.shape.rig.up, upright).to(problem.data)
+        clouds = problem.data @ turns.mT
+        points, mask = self.fitting(clouds, problem.valid.expand(len(turns), -1))
+        raw = self(points.to(self.queries), mask)
+        marks = raw.marks.to(clouds) @ turns.unsqueeze(1)
+        every = marks.flatten(0, 1).unsqueeze(0)
+        drawn = problem.draw(_STATES.num_data, generator)
+        cost = two_sided_cost(*closeness(every, drawn, problem.size), drawn)[0]
+        ranked = every[0, cost.argsort()]
+        apart = (ranked.unsqueeze(1) - ranked).norm(dim=-1).mean(-1)
+        return self._states(problem, surface, ranked[distinct_first((apart < _STATES.same * problem.size)[None])[0, :count]])
+
+    def _states(self, problem: ShapeProblem, surface: RigSurface, marks: Tensor) -> Tensor:
+        """Return the states (B, D + K) in which the body's marks lie at places (B, P, 3)."""
+        tree = problem.skin.shape
+        rig, space = tree.rig, tree.space
+        skin, mean = _mark_skin(tree, surface, self.marks), torch.cat([rig.rest, space.mean]).repeat(len(marks), 1)
+        one = torch.ones_like(marks[..., 0])
+        motion = fit_rigid(skin.points.expand_as(marks), marks, one)
+        mean[:, :3] = transform_points(motion, mean[:, None, :3])[:, 0]
+        mean[:, 3:BASE_DOFS] = so3_log(motion[:, :3, :3])
+        precision = torch.cat([joint_precision(rig, problem.size, _STATES.joint_std), space.std.square().reciprocal()])
+        matches = EStep(one, marks, one.sum(1), torch.zeros_like(one[:, 0]))
+        sigma = torch.full_like(mean[:, 0], _STATES.error * problem.size)
+        objective = registration_objective(skin, matches, sigma, GaussianPosePrior(mean, precision))
+        state, rows = mean, problem.rows(torch.zeros(len(marks), dtype=torch.int64))
+        for _ in range(_STATES.steps):
+            state = rows.step(objective(state), state).state
+        return state
+
+    def save(self, path: str | os.PathLike[str], training: Mapping[str, Any] | None = None) -> None:
+        """Write the weights in half precision as safetensors, and beside them JSON that tells for which body.
+
+        Args:
+            path: to be written, ``.safetensors``.
+            training: what to remember of the training.
+        """
+        record = {
+            "kind": _KIND, "vertices": self.num_vertices, "shape_size": self.shape_size,
+            "marks": self.marks.tolist(), "sizes": asdict(self.size), "training": dict(training or {}),
+        }  # fmt: skip
+        save_tensors(path, {name: value.half() for name, value in self.state_dict().items()}, record)
+
+    @staticmethod
+    def load(
+        path: str | os.PathLike[str], body: ArticulatedShape, *, limits: FileLimits = DEFAULT_LIMITS
+    ) -> PersonProposer:
+        """Return the network of a file for the body that it was trained for.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            FormatError: if the file is damaged, holds no network, or one for another body.
+        """
+        tensors, record = load_tensors(path, limits=limits)
+        if record.get("kind") != _KIND:
+            raise FormatError(f"{path}: holds no {_KIND}, got {record.get('kind')!r}")
+        try:
+            # Layers draw weights before those of the file replace them: the caller's random state stays.
+            with torch.random.fork_rng(devices=[]):
+                found = PersonProposer(body, ProposerSize(**record["sizes"]), marks=torch.tensor(record["marks"]))
+            found.load_state_dict({name: value.float() for name, value in tensors.items()})
+            is_same = record["vertices"] == found.num_vertices
+        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+            raise FormatError(f"{path}: holds no {_KIND} of this version ({error})") from error
+        if not is_same:
+            raise FormatError(f"{path}: was trained for another body; train one with torchreg train-initializer")
+        return found.to(body.rest.device).requires_grad_(False).eval()
 
 
 def spread_marks(points: Tensor) -> Tensor:
@@ -95,3 +233,32 @@ def spread_marks(points: Tensor) -> Tensor:
 def is_body(shape: ArticulatedShape) -> bool:
     """Whether a shape is a body of anny's: with coefficients, and with its joints."""
     return shape.space is not None and {"upperarm01.L", "lowerleg01.R", "spine05"} <= set(shape.part_names)
+
+
+@lru_cache(maxsize=4)
+def _read(path: Path, _changed: int, body: ArticulatedShape) -> PersonProposer:
+    # What is made in inference mode could not be used outside of it.
+    with torch.inference_mode(False):
+        return PersonProposer.load(path, body)
+
+
+def shipped_people(body: ArticulatedShape) -> PersonProposer | None:
+    """Return the network that comes with torchreg for a body, read once; None for other shapes."""
+    if not is_body(body) or not BODY_WEIGHTS.exists():
+        return None
+    return _read(BODY_WEIGHTS, BODY_WEIGHTS.stat().st_mtime_ns, body)
+
+
+def _turns(own: Direction, upright: Direction | None) -> Tensor:
+    """Return rotations (U, 3, 3) that take what is upright in data to the upright of the body."""
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    ups = axes if upright is None else torch.tensor([upright], dtype=torch.float64)
+    return rotation_between(torch.nn.functional.normalize(ups, dim=-1), torch.tensor(own, dtype=torch.float64))
+
+
+def _mark_skin(tree: ShapedTree, surface: RigSurface, marks: Tensor) -> ShapedSkin:
+    """Return the skin of some vertices (P,), each the first corner of a face."""
+    first = (surface.faces == marks[:, None, None]).flatten(1).int().argmax(-1)
+    corners = surface.faces.repeat_interleave(3, 0)[first]
+    shares = torch.nn.functional.one_hot(first % 3, 3).to(tree.rest)
+    return ShapedSkin(tree, corners, shares, surface.weights[marks].to(tree.rest))
