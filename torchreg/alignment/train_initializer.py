@@ -33,7 +33,7 @@ class _Training:
     surface_points: int = 3000  # of which clouds are drawn
     compared: int = 64  # points by which poses are compared
     width: tuple[float, float] = (0.15, 0.02)  # scale of the errors' distribution, from the first step to the last
-    people_width: tuple[float, float] = (0.05, 0.015)  # the same of people: headings are apart from the start
+    people_width: tuple[float, float] = (0.015, 0.01)  # the same of people: headings are apart from the start
     surface_weight: float = 1.0  # of what tokens tell, beside the poses
     surface_width: float = 0.05  # error of a token at which its loss turns from squares to absolute values
     warm_up: int = 200  # steps until the full rate
@@ -100,7 +100,7 @@ def train_initializer(
     *,
     size: ProposerSize | None = None,
     progress: Callable[[TrainingRow], None] | None = None,
-) -> PoseProposer:
+) -> PoseProposer | PersonProposer:
     """Train a network that proposes poses of a shape, on made-up clouds; go on where an earlier run ended.
 
     Clouds are one-sided or whole, noisy, with outliers and holes, in any rotation. The loss is the negative logarithm
@@ -136,7 +136,7 @@ def train_initializer(
             if progress is not None:
                 progress(row)
     run.net.save(path, {**asdict(config), "minutes": run.seconds / 60, "steps": run.step})
-    return PoseProposer.load(path, shape)
+    return PoseProposer.load(path, shape) if isinstance(run.net, PoseProposer) else PersonProposer.load(path)
 
 
 class Lesson(Protocol):
@@ -180,7 +180,7 @@ class PersonLesson:
     width = _TRAINING.people_width
 
     def __init__(self, body: ArticulatedShape, size: ProposerSize | None) -> None:
-        self.net = PersonProposer(body, size).to(body.rest.device)
+        self.net = PersonProposer.of(body, size)
         self.people = PeopleBatches(body, self.net.marks)
         self.rest = self.people.rest
 

@@ -77,9 +77,12 @@ class PersonProposer(CloudNet):
     group of marks. Places rather than angles: they are linear in what is seen, and of all sizes alike.
 
     Args:
-        body: with coefficients, in metres.
         size: see `ProposerSize`.
-        marks: (P,) numbers of the vertices, as `spread_marks` gives them, which it does by default.
+        shape_size: of the mean person, metres.
+        marks: (P,) numbers of vertices, as `spread_marks` gives them.
+        at_rest: (P, 3) where they lie on the mean person, shares of the size.
+        up: direction (3,) that is upright there.
+        num_vertices: of the body.
 
     Shape of ``forward(points, mask)``: as of `PoseProposer`; see `RawPeople`.
 
@@ -93,20 +96,15 @@ class PersonProposer(CloudNet):
     headings: Tensor
 
     def __init__(
-        self, body: ArticulatedShape, size: ProposerSize | None = None, *, marks: Tensor | None = None
+        self, size: ProposerSize, shape_size: float, marks: Tensor, at_rest: Tensor, up: Direction, num_vertices: int
     ) -> None:
-        space = body.coefficient_space()
-        at_mean = space.rest(space.mean)[0].detach().float()
-        extent = float((at_mean.amax(0) - at_mean.amin(0)).norm())
-        super().__init__(size or PERSON_SIZE, extent)
-        width, self.num_vertices = self.size.width, len(at_mean)
-        marks = spread_marks(at_mean) if marks is None else marks
-        self.register_buffer("marks", marks, persistent=False)
-        self.register_buffer("at_rest", (at_mean[marks] - at_mean[marks].mean(0)) / extent, persistent=False)
+        super().__init__(size, shape_size)
+        self.num_vertices, width, self.up = num_vertices, size.width, up
         # Each hypothesis begins with another heading: front and back look much alike, and their mean like neither.
-        angles = torch.arange(self.size.hypotheses) * (math.tau / self.size.hypotheses)
-        headings = so3_exp(angles.unsqueeze(-1) * torch.tensor(body.up))
-        self.register_buffer("headings", rotation_to_6d(headings).to(at_mean), persistent=False)
+        angles = torch.arange(size.hypotheses) * (math.tau / size.hypotheses)
+        headings = rotation_to_6d(so3_exp(angles.unsqueeze(-1) * torch.tensor(up))).float()
+        for name, value in {"marks": marks, "at_rest": at_rest, "headings": headings}.items():
+            self.register_buffer(name, value, persistent=False)
         self.told = nn.Linear(width, 7)
         self.condition = nn.Linear(width, width)
         last = nn.Linear(width, (3 * _MARKS.each + 1) * _MARKS.groups)
@@ -116,6 +114,15 @@ class PersonProposer(CloudNet):
             for layer in (last, self.told):
                 layer.weight.mul_(0.1)
                 layer.bias.zero_()
+
+    @classmethod
+    def of(cls, body: ArticulatedShape, size: ProposerSize | None = None) -> PersonProposer:
+        """Return a network for a body with coefficients, in metres, untrained."""
+        space = body.coefficient_space()
+        at_mean = space.rest(space.mean)[0].detach().float()
+        extent, marks = float((at_mean.amax(0) - at_mean.amin(0)).norm()), spread_marks(at_mean)
+        at_rest = (at_mean[marks] - at_mean[marks].mean(0)) / extent
+        return cls(size or PERSON_SIZE, extent, marks, at_rest, body.up, len(at_mean)).to(at_mean.device)
 
     def forward(self, points: Tensor, mask: Tensor) -> RawPeople:
         """Return places, see the class."""
@@ -191,35 +198,35 @@ class PersonProposer(CloudNet):
             training: what to remember of the training.
         """
         record = {
-            "kind": _KIND, "vertices": self.num_vertices, "shape_size": self.shape_size,
+            "kind": _KIND, "shape_size": self.shape_size, "up": list(self.up), "num_vertices": self.num_vertices,
             "marks": self.marks.tolist(), "sizes": asdict(self.size), "training": dict(training or {}),
         }  # fmt: skip
-        save_tensors(path, {name: value.half() for name, value in self.state_dict().items()}, record)
+        state = {**self.state_dict(), "at_rest": self.at_rest}
+        save_tensors(path, {name: value.half() for name, value in state.items()}, record)
 
     @staticmethod
-    def load(
-        path: str | os.PathLike[str], body: ArticulatedShape, *, limits: FileLimits = DEFAULT_LIMITS
-    ) -> PersonProposer:
-        """Return the network of a file for the body that it was trained for.
+    def load(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> PersonProposer:
+        """Return the network of a file.
 
         Raises:
             FileNotFoundError: if there is no such file.
-            FormatError: if the file is damaged, holds no network, or one for another body.
+            FormatError: if the file is damaged, or holds no such network.
         """
         tensors, record = load_tensors(path, limits=limits)
         if record.get("kind") != _KIND:
             raise FormatError(f"{path}: holds no {_KIND}, got {record.get('kind')!r}")
+        state = {name: value.float() for name, value in tensors.items()}
         try:
             # Layers draw weights before those of the file replace them: the caller's random state stays.
             with torch.random.fork_rng(devices=[]):
-                found = PersonProposer(body, ProposerSize(**record["sizes"]), marks=torch.tensor(record["marks"]))
-            found.load_state_dict({name: value.float() for name, value in tensors.items()})
-            is_same = record["vertices"] == found.num_vertices
-        except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+                found = PersonProposer(
+                    ProposerSize(**record["sizes"]), record["shape_size"], torch.tensor(record["marks"]),
+                    state.pop("at_rest"), tuple(record["up"]), record["num_vertices"],
+                )  # fmt: skip
+            found.load_state_dict(state)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise FormatError(f"{path}: holds no {_KIND} of this version ({error})") from error
-        if not is_same:
-            raise FormatError(f"{path}: was trained for another body; train one with torchreg train-initializer")
-        return found.to(body.rest.device).requires_grad_(False).eval()
+        return found.requires_grad_(False).eval()
 
 
 def spread_marks(points: Tensor) -> Tensor:
@@ -235,18 +242,19 @@ def is_body(shape: ArticulatedShape) -> bool:
     return shape.space is not None and {"upperarm01.L", "lowerleg01.R", "spine05"} <= set(shape.part_names)
 
 
-@lru_cache(maxsize=4)
-def _read(path: Path, _changed: int, body: ArticulatedShape) -> PersonProposer:
+@lru_cache(maxsize=1)
+def _read(path: Path, _changed: int) -> PersonProposer:
     # What is made in inference mode could not be used outside of it.
     with torch.inference_mode(False):
-        return PersonProposer.load(path, body)
+        return PersonProposer.load(path)
 
 
 def shipped_people(body: ArticulatedShape) -> PersonProposer | None:
-    """Return the network that comes with torchreg for a body, read once; None for other shapes."""
+    """Return the network that comes with torchreg for a body of anny's, read once; None for other shapes."""
     if not is_body(body) or not BODY_WEIGHTS.exists():
         return None
-    return _read(BODY_WEIGHTS, BODY_WEIGHTS.stat().st_mtime_ns, body)
+    found = _read(BODY_WEIGHTS, BODY_WEIGHTS.stat().st_mtime_ns)
+    return found if found.num_vertices == len(body.file_surface().vertices) else None
 
 
 def _turns(own: Direction, upright: Direction | None) -> Tensor:

@@ -13,6 +13,7 @@ from torchreg.alignment.evidence.clusters import leaves_clusters
 from torchreg.alignment.evidence.confidence import EVIDENCE
 from torchreg.alignment.evidence.observability import dof_confidence
 from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal
+from torchreg.alignment.fit.problem import INLIER_SHARE
 from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
@@ -22,6 +23,7 @@ from torchreg.alignment.shape.clothing import CLOTH, clothed_rig
 from torchreg.alignment.shape.clothing_evidence import are_clothes_likelier
 from torchreg.alignment.shape.person_covariance import noise_covariance, shared_covariance
 from torchreg.alignment.shape.person_gradient import person_with_gradients
+from torchreg.alignment.shape.person_proposer import shipped_people
 from torchreg.alignment.shape.person_search import lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_fit import (
     SHAPE_FIT,
@@ -39,7 +41,7 @@ class PersonRows:
     """States (S T, D + K) of S people in T scans that share coefficients, in the end of the best person.
 
     They solve `coarse`, a sample of the data of `problem`; `sigma` (1,) is the last kernel width of the EM and `lead`
-    (1,) the cost by which the best different state is worse in a search.
+    (1,) the cost by which the best different state is worse in a search; those that a network proposed are so told.
     """
 
     task: Task
@@ -49,6 +51,7 @@ class PersonRows:
     generator: torch.Generator
     sigma: Tensor
     lead: Tensor | None = None
+    is_proposed: bool = False
     history: list[AlignRecord] = field(default_factory=list)
 
     @classmethod
@@ -71,14 +74,19 @@ class PersonRows:
 
     @classmethod
     @torch.inference_mode()
-    def of_scans(cls, task: Task, data: Tensor, valid: Tensor, poses: Tensor | None) -> PersonRows:
+    def of_scans(
+        cls, task: Task, data: Tensor, valid: Tensor, poses: Tensor | None, *, proposes: bool = True
+    ) -> PersonRows:
         """Return the rows of one person in T scans (T, M, 3), with poses (T, num_dofs) at the mean coefficients."""
         shape, config, generator = task.shape, task.config, torch.Generator().manual_seed(task.config.seed)
         views = [frame.camera.position for frame in task.seen.frames]
         viewpoints = torch.stack(views) if views else None
-        problem, start = shape_problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
+        proposer = shipped_people(shape) if poses is None and proposes else None
+        problem, start = shape_problem(
+            shape, data, valid, poses, viewpoints, config=config, generator=generator, proposer=proposer
+        )
         coarse = problem.draw(SHAPE_FIT.coarse_data, generator)
-        return cls(task, problem, coarse, start, generator, sigma=start[:1, 0])
+        return cls(task, problem, coarse, start, generator, start[:1, 0], is_proposed=proposer is not None)
 
     def record(self, step: AlignRecord) -> None:
         """Keep the record of a step and pass it on, with the poses alone, in the coordinates of the data."""
@@ -90,9 +98,17 @@ class PersonRows:
             self.task.on_step(step)
 
     def annealed(self) -> PersonRows:
-        """Return the best rows after an annealed EM, with normals, which registers shapes of different sizes."""
+        """Return the best rows after an annealed EM, with normals, which registers shapes of different sizes.
+
+        People proposed by a network have about their size, and are fitted alone.
+        """
+        if self.is_proposed:
+            fitted = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps)
+            return self._best(replace(fitted, sigma=torch.full_like(fitted.sigma, ANNEALING.stop * self.problem.size)))
         widths = self.task.config.schedule or ANNEALING.schedule(self.problem.size, SHAPE_FIT.em_steps)
-        found = self._anneal(self.coarse, self.state, widths)
+        return self._best(self._anneal(self.coarse, self.state, widths))
+
+    def _best(self, found: StageResult) -> PersonRows:
         count = SHAPE_FIT.num_found_kept if self._searched else SHAPE_FIT.num_kept
         kept = self.problem.people(self.coarse.cost_of_people(found.pose).argsort()[:count])
         problem, coarse = self.problem.rows(kept), self.coarse.rows(kept)
@@ -107,6 +123,8 @@ class PersonRows:
 
     def restarted(self) -> PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
+        if self.is_proposed and self._is_doubtful():
+            return self._searched_too().restarted()
         state = self._restarted_limb() if self.problem.scans == 1 else self.state
         costs = self.coarse.cost_of_people(state)
         lead = lead_over_rivals(self.coarse, state, costs) if self._searched else None
@@ -153,6 +171,23 @@ class PersonRows:
     def _descended(self, problem: ShapeProblem, state: Tensor, widths: SigmaSchedule) -> Tensor:
         """Return states (B, D + K) after an annealed EM and a coarse fit to the surface."""
         return self._fit(problem, self._anneal(problem, state, widths).pose, SHAPE_FIT.coarse_steps).pose
+
+    def _is_doubtful(self) -> bool:
+        """Whether the best row leaves clusters of data over, or explains less than half of them."""
+        best = self.coarse.cost_of_people(self.state).argmin().unsqueeze(0)
+        one = self.coarse.rows(best)
+        explained = one.surface.distance(one.data, self.state[best]).abs() < INLIER_SHARE * one.size
+        few = 2 * (explained & one.valid).sum(-1) < one.valid.sum(-1)
+        return bool(few | leaves_clusters(one, self.state[best]))
+
+    def _searched_too(self) -> PersonRows:
+        """Return the rows together with those of people who are searched for."""
+        data, valid = self.problem.data[:1] + self.problem.origin[:1].unsqueeze(1), self.problem.valid[:1]
+        rows = PersonRows.of_scans(self.task, data, valid, None, proposes=False)
+        state = torch.cat([self.state, replace(rows, history=self.history).annealed().fitted().state])
+        every = torch.zeros(len(state), dtype=torch.int64)
+        problem, coarse = self.problem.rows(every), self.coarse.rows(every)
+        return replace(self, problem=problem, coarse=coarse, state=state, is_proposed=False)
 
     def _restarted_limb(self) -> Tensor:
         """Return states (B, D + K) in one scan, the best with one limb re-initialized where clusters are left over."""
