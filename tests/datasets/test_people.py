@@ -26,7 +26,9 @@ def with_habits(monkeypatch, arms=None, legs=None):
     still = replace(people_poses._TRUNK, every=(0, 0), spine=(0, 0, 0), head=(0, 0, 0), bent=0.0)
     monkeypatch.setattr(people_poses, "_TRUNK", still)
     for name, habits, chosen in (("_ARMS", people_poses._ARMS, arms), ("_LEGS", people_poses._LEGS, legs)):
-        shares = [replace(habit, share=float(chosen is None or number == chosen)) for number, habit in enumerate(habits)]
+        shares = [
+            replace(habit, share=float(chosen is None or number == chosen)) for number, habit in enumerate(habits)
+        ]
         monkeypatch.setattr(people_poses, name, tuple(shares))
 
 
@@ -73,7 +75,9 @@ def test_a_bare_whole_cloud_is_of_the_posed_surface_and_the_marks_are_its_vertic
     for row in range(6):
         vertices = body.vertices(batch.poses[row, : body.num_dofs], batch.poses[row, body.num_dofs :])
         offset = vertices[people.index].mean(0)
-        torch.testing.assert_close(batch.points[row], vertices[people.index][batch.index[row]] - offset, atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            batch.points[row], vertices[people.index][batch.index[row]] - offset, atol=1e-4, rtol=0
+        )
         torch.testing.assert_close(batch.marks[row], vertices[marks] - offset, atol=1e-4, rtol=0)
 
 

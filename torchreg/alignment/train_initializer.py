@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -139,22 +138,8 @@ def train_initializer(
     return PoseProposer.load(path, shape) if isinstance(run.net, PoseProposer) else PersonProposer.load(path)
 
 
-class Lesson(Protocol):
-    """What a network learns: made-up clouds, and how wrong its proposals are."""
-
-    net: PoseProposer | PersonProposer
-    rest: Tensor
-    width: tuple[float, float]
-
-    def clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
-        """Return clouds with their truth, whose index tells of places (N, 3) at `rest`, metres."""
-
-    def errors(self, raw: Any, batch: Any) -> Tensor:
-        """Return the mean distances (B, K) of proposed points from where they are, as a share of the size."""
-
-
 class PoseLesson:
-    """Poses of any shape of solids or a mesh."""
+    """Poses of any shape: clouds whose index tells of places (N, 3) at `rest`, and how wrong proposals are."""
 
     width = _TRAINING.width
 
@@ -202,7 +187,7 @@ class _Run:
         torch.manual_seed(config.seed)
         self.config, self.checkpoint, self.curve = config, path.with_suffix(".pt"), path.with_suffix(".jsonl")
         device = shape.rest.device
-        self.lesson: Lesson = PersonLesson(shape, size) if is_body(shape) else PoseLesson(shape, size)
+        self.lesson = PersonLesson(shape, size) if is_body(shape) else PoseLesson(shape, size)
         self.net = self.lesson.net
         self.optimizer = torch.optim.AdamW(self.net.parameters(), lr=config.rate, weight_decay=_TRAINING.decay)
         self.generator = torch.Generator(device).manual_seed(config.seed)
@@ -295,9 +280,7 @@ def pose_errors(raw: RawPoses, batch: CloudBatch, compared: LinearBlendSkin, siz
     return (found - truth).norm(dim=-1).mean(-1) / size
 
 
-def proposal_loss(
-    raw: RawPoses | RawPeople, batch: CloudBatch, errors: Tensor, rest: Tensor, width: float
-) -> Tensor:
+def proposal_loss(raw: RawPoses | RawPeople, batch: CloudBatch, errors: Tensor, rest: Tensor, width: float) -> Tensor:
     """Return the loss () of proposals with errors (B, K), see `train_initializer`; ``width`` scales the errors.
 
     Lengths, those of places (N, 3) at rest too, are shares of the size.

@@ -164,6 +164,7 @@ class CloudDraw:
     scenes: float  # share of the clouds
 
     def uniform(self, *size: int) -> Tensor:
+        """Return numbers from 0 to 1."""
         return torch.rand(size, generator=self.generator, device=self.generator.device).to(self.like)
 
     def between(self, limits: tuple[float, float], *size: int) -> Tensor:
@@ -172,6 +173,7 @@ class CloudDraw:
         return (low + (high - low) * self.uniform(*size)).exp()
 
     def normal(self, *size: int) -> Tensor:
+        """Return numbers of a standard deviation of 1."""
         return _normal(size, self.generator, self.like)
 
     def picked(self, weight: Tensor, count: int) -> tuple[Tensor, Tensor]:

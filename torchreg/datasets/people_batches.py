@@ -48,7 +48,7 @@ _GARMENTS = (
 
 @dataclass(frozen=True, eq=False)
 class PeopleBatch(CloudBatch):
-    """Clouds of people, whose poses are states (B, D + K), the places (B, P, 3) of the marks, and sizes (B,), metres."""
+    """Clouds of people: poses are states (B, D + K), marks their places (B, P, 3), sizes at rest (B,), metres."""
 
     marks: Tensor
     sizes: Tensor

@@ -121,7 +121,9 @@ class CloudNet(nn.Module):
         self.size, self.shape_size, width = size, shape_size, size.width
         self.register_buffer("frequencies", math.pi * 2.0 ** torch.arange(size.waves), persistent=False)
         self.around = nn.Sequential(nn.Linear(4, 48), nn.GELU(), nn.Linear(48, width // 2), nn.GELU())
-        self.embed = nn.Sequential(nn.Linear(width // 2 + 3 + 6 * size.waves, width), nn.GELU(), nn.Linear(width, width))
+        self.embed = nn.Sequential(
+            nn.Linear(width // 2 + 3 + 6 * size.waves, width), nn.GELU(), nn.Linear(width, width)
+        )
         self.encoder = nn.ModuleList(_Block(width, size.heads) for _ in range(size.encoder))
         self.queries = nn.Parameter(torch.randn(size.hypotheses, width))
         self.cross = nn.ModuleList(_Block(width, size.heads) for _ in range(size.decoder))

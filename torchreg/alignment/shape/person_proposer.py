@@ -1,4 +1,4 @@
-"""A network that proposes people: from clouds of a body to several places of its surface each, and states from these."""
+"""A network that proposes people: from clouds of a body to places of its surface, and states from these."""
 
 from __future__ import annotations
 
@@ -170,7 +170,8 @@ class PersonProposer(CloudNet):
         cost = two_sided_cost(*closeness(every, drawn, problem.size), drawn)[0]
         ranked = every[0, cost.argsort()]
         apart = (ranked.unsqueeze(1) - ranked).norm(dim=-1).mean(-1)
-        return self._states(problem, surface, ranked[distinct_first((apart < _STATES.same * problem.size)[None])[0, :count]])
+        different = distinct_first((apart < _STATES.same * problem.size).unsqueeze(0))[0, :count]
+        return self._states(problem, surface, ranked[different])
 
     def _states(self, problem: ShapeProblem, surface: RigSurface, marks: Tensor) -> Tensor:
         """Return the states (B, D + K) in which the body's marks lie at places (B, P, 3)."""
@@ -184,7 +185,8 @@ class PersonProposer(CloudNet):
         precision = torch.cat([joint_precision(rig, problem.size, _STATES.joint_std), space.std.square().reciprocal()])
         matches = EStep(one, marks, one.sum(1), torch.zeros_like(one[:, 0]))
         sigma = torch.full_like(mean[:, 0], _STATES.error * problem.size)
-        objective = registration_objective(skin, matches, sigma, GaussianPosePrior(mean, precision))
+        prior = GaussianPosePrior(mean, precision)
+        objective = registration_objective(skin, matches, sigma, prior)  # type: ignore[arg-type]
         state, rows = mean, problem.rows(torch.zeros(len(marks), dtype=torch.int64))
         for _ in range(_STATES.steps):
             state = rows.step(objective(state), state).state

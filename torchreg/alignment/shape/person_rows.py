@@ -81,7 +81,7 @@ class PersonRows:
         shape, config, generator = task.shape, task.config, torch.Generator().manual_seed(task.config.seed)
         views = [frame.camera.position for frame in task.seen.frames]
         viewpoints = torch.stack(views) if views else None
-        proposer = shipped_people(shape) if poses is None and proposes else None
+        proposer = (task.people or shipped_people(shape)) if poses is None and proposes else None
         problem, start = shape_problem(
             shape, data, valid, poses, viewpoints, config=config, generator=generator, proposer=proposer
         )
