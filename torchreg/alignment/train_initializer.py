@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -196,7 +197,7 @@ class _Run:
             self._resume()
         with torch.no_grad():
             generator = torch.Generator(device).manual_seed(config.seed + 1)
-            self.validation = self.lesson.clouds(_TRAINING.validation, generator)
+            self.validation: Any = self.lesson.clouds(_TRAINING.validation, generator)
 
     @property
     def share(self) -> float:
@@ -206,7 +207,7 @@ class _Run:
     def advance(self) -> Tensor:
         """Make a step of the optimizer and return the sum of losses since the last validation."""
         with torch.no_grad():
-            batch = self.lesson.clouds(self.config.batch, self.generator)
+            batch: Any = self.lesson.clouds(self.config.batch, self.generator)
         device = batch.points.device.type
         with torch.autocast(device, dtype=torch.bfloat16, enabled=device == "cuda"):
             raw = self.net(batch.points, batch.mask)

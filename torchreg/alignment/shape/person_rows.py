@@ -100,15 +100,13 @@ class PersonRows:
     def annealed(self) -> PersonRows:
         """Return the best rows after an annealed EM, with normals, which registers shapes of different sizes.
 
-        People proposed by a network have about their size, and are fitted alone.
+        People proposed by a network have about their size: they are fitted alone, and all are kept as rivals.
         """
         if self.is_proposed:
-            fitted = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps)
-            return self._best(replace(fitted, sigma=torch.full_like(fitted.sigma, ANNEALING.stop * self.problem.size)))
+            state = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps).pose
+            return replace(self, state=state, sigma=torch.full_like(self.sigma, ANNEALING.stop * self.problem.size))
         widths = self.task.config.schedule or ANNEALING.schedule(self.problem.size, SHAPE_FIT.em_steps)
-        return self._best(self._anneal(self.coarse, self.state, widths))
-
-    def _best(self, found: StageResult) -> PersonRows:
+        found = self._anneal(self.coarse, self.state, widths)
         count = SHAPE_FIT.num_found_kept if self._searched else SHAPE_FIT.num_kept
         kept = self.problem.people(self.coarse.cost_of_people(found.pose).argsort()[:count])
         problem, coarse = self.problem.rows(kept), self.coarse.rows(kept)
@@ -116,16 +114,28 @@ class PersonRows:
 
     def fitted(self) -> PersonRows:
         """Return the rows fitted to the surface, and again after a narrower annealing, where that explains more."""
-        state = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps).pose
-        again = self._descended(self.coarse, state, self._narrow)
-        better = self.coarse.cost_of_people(again) < self.coarse.cost_of_people(state)
-        return replace(self, state=torch.where(better.repeat_interleave(self.coarse.scans).unsqueeze(-1), again, state))
+        if not self.is_proposed:
+            state = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps).pose
+            return replace(self, state=self._again(self.coarse, state))
+        best = self._best()
+        again = self._again(self.coarse.rows(best), self.state[best])
+        return replace(self, state=self.state.index_copy(0, best, again))
+
+    def _again(self, problem: ShapeProblem, state: Tensor) -> Tensor:
+        again = self._descended(problem, state, self._narrow)
+        better = problem.cost_of_people(again) < problem.cost_of_people(state)
+        return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), again, state)
+
+    def _best(self) -> Tensor:
+        """Return the index (1,) of the best row of one scan."""
+        return self.coarse.cost_of_people(self.state).argmin().unsqueeze(0)
 
     def restarted(self) -> PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
-        if self.is_proposed and self._is_doubtful():
-            return self._searched_too().restarted()
         state = self._restarted_limb() if self.problem.scans == 1 else self.state
+        swung = replace(self, state=state)
+        if self.is_proposed and swung._is_doubtful():
+            return swung._searched_too().restarted()
         costs = self.coarse.cost_of_people(state)
         lead = lead_over_rivals(self.coarse, state, costs) if self._searched else None
         best = self.problem.people(costs.argmin().unsqueeze(0))
@@ -174,7 +184,7 @@ class PersonRows:
 
     def _is_doubtful(self) -> bool:
         """Whether the best row leaves clusters of data over, or explains less than half of them."""
-        best = self.coarse.cost_of_people(self.state).argmin().unsqueeze(0)
+        best = self._best()
         one = self.coarse.rows(best)
         explained = one.surface.distance(one.data, self.state[best]).abs() < INLIER_SHARE * one.size
         few = 2 * (explained & one.valid).sum(-1) < one.valid.sum(-1)
@@ -199,7 +209,7 @@ class PersonRows:
             return state
         limbs = limb_restarts(one, state[best[0]], SHAPE_FIT.num_swung, self.generator)
         others = [(limbs, self._narrow)] if len(limbs) else []  # a chain without branches has no limb to swing
-        if self._searched:
+        if self._searched and not self.is_proposed:
             others.append((rotation_restarts(one, state[best[0]]), ANNEALING.schedule(size, SHAPE_FIT.em_steps)))
         if not others:
             return state
