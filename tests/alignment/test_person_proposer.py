@@ -9,7 +9,7 @@ import torchreg as tr
 from tests.people import body_like_anny
 from torchreg.alignment import train_initializer as train_module
 from torchreg.alignment.shape import person_proposer, person_rows
-from torchreg.alignment.shape.person_proposer import PersonProposer, RawPeople, shipped_people
+from torchreg.alignment.shape.person_proposer import BODY_WEIGHTS, PersonProposer, RawPeople, shipped_people
 from torchreg.alignment.shape.shape_fit import shape_problem
 from torchreg.datasets import people_batches
 from torchreg.datasets.people_poses import people_states
@@ -122,8 +122,15 @@ def test_training_by_the_one_command_and_files(body, tmp_path, monkeypatch):
     torch.testing.assert_close(moved, again(points, mask).marks + torch.tensor([1.0, -2.0, 0.5]), atol=1e-3, rtol=0)
     with pytest.raises(tr.errors.FormatError, match="holds no PoseProposer"):
         tr.PoseProposer.load(path, body)
-    torch.nn.Module.train(trained)
     tr.PoseProposer(tr.Hand(), TINY).save(tmp_path / "hand.safetensors")
     with pytest.raises(tr.errors.FormatError, match="holds no PersonProposer"):
         PersonProposer.load(tmp_path / "hand.safetensors")
+
+
+def test_the_network_of_anny_s_body_is_small_and_for_that_body_alone(body):
+    net = PersonProposer.load(BODY_WEIGHTS)
+    assert BODY_WEIGHTS.stat().st_size < 3e6
+    assert not any(parameter.requires_grad for parameter in net.parameters())
+    assert int(net.marks.max()) < net.num_vertices == 13718
+    assert shipped_people(body) is None, "other vertices"
     assert shipped_people(tr.Hand()) is None

@@ -245,17 +245,17 @@ def is_body(shape: ArticulatedShape) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, _changed: int) -> PersonProposer:
+def _read(path: Path, _changed: int, device: torch.device) -> PersonProposer:
     # What is made in inference mode could not be used outside of it.
     with torch.inference_mode(False):
-        return PersonProposer.load(path)
+        return PersonProposer.load(path).to(device)
 
 
 def shipped_people(body: ArticulatedShape) -> PersonProposer | None:
     """Return the network that comes with torchreg for a body of anny's, read once; None for other shapes."""
     if not is_body(body) or not BODY_WEIGHTS.exists():
         return None
-    found = _read(BODY_WEIGHTS, BODY_WEIGHTS.stat().st_mtime_ns)
+    found = _read(BODY_WEIGHTS, BODY_WEIGHTS.stat().st_mtime_ns, body.rest.device)
     return found if found.num_vertices == len(body.file_surface().vertices) else None
 
 
