@@ -93,8 +93,8 @@ def test_people_are_proposed_in_the_frame_in_which_they_stand(body, sitter, axis
 def test_a_good_proposal_needs_no_search_and_a_bad_one_is_searched_for(body, sitter, monkeypatch):
     state, points = sitter
     searched = []
-    search = person_rows.PersonRows._searched_too
-    monkeypatch.setattr(person_rows.PersonRows, "_searched_too", lambda rows: searched.append(1) or search(rows))
+    search = person_rows.PersonRows.searched_too
+    monkeypatch.setattr(person_rows.PersonRows, "searched_too", lambda rows: searched.append(1) or search(rows))
     vertices = body.vertices(*state.tensor_split([body.num_dofs]))
     monkeypatch.setattr(person_rows, "shipped_people", lambda shape: told(body, state, points))
     found = tr.align(body, points, fit_shape=True, clothed=False, config=QUICK)

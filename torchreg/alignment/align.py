@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.annealed_em import OnStep
 from torchreg.alignment.inputs import Task
 from torchreg.alignment.known_dofs import KnownDofs
@@ -152,8 +153,9 @@ def _aligned(task: Task, data: Any, mask: Tensor | None = None, **keypoints: Any
     with torch.inference_mode(), one_thread(is_small):
         rows = rows.annealed()  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
         rows = rows.fitted()  # eqs. 21 and 22: section 3.4
-        rows = rows.restarted()
-        found = rows.finished().judged()
+        found = rows.restarted().finished().judged()
+        if isinstance(rows, PersonRows) and rows.is_proposed and float(found.confidence) < CALIBRATION.doubtful:
+            found = rows.searched_too().restarted().finished().judged()
     person = task.shape if found.coefficients is None else task.shape.with_coefficients(found.coefficients)
     return replace(to_world(found, task.seen.origin), shape=person)
 

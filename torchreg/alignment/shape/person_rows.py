@@ -13,7 +13,6 @@ from torchreg.alignment.evidence.clusters import leaves_clusters
 from torchreg.alignment.evidence.confidence import EVIDENCE
 from torchreg.alignment.evidence.observability import dof_confidence
 from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal
-from torchreg.alignment.fit.problem import INLIER_SHARE
 from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
@@ -88,6 +87,15 @@ class PersonRows:
         coarse = problem.draw(SHAPE_FIT.coarse_data, generator)
         return cls(task, problem, coarse, start, generator, start[:1, 0], is_proposed=proposer is not None)
 
+    def searched_too(self) -> PersonRows:
+        """Return the fitted rows that a network proposed together with those of people searched for in the one scan."""
+        data, valid = self.problem.data[:1] + self.problem.origin[:1].unsqueeze(1), self.problem.valid[:1]
+        rows = PersonRows.of_scans(self.task, data, valid, None, proposes=False)
+        state = torch.cat([self.state, replace(rows, history=self.history).annealed().fitted().state])
+        every = torch.zeros(len(state), dtype=torch.int64)
+        problem, coarse = self.problem.rows(every), self.coarse.rows(every)
+        return replace(self, problem=problem, coarse=coarse, state=state, is_proposed=False)
+
     def record(self, step: AlignRecord) -> None:
         """Keep the record of a step and pass it on, with the poses alone, in the coordinates of the data."""
         dofs, scans = self.task.shape.num_dofs, len(step.pose) // self.problem.scans
@@ -133,9 +141,6 @@ class PersonRows:
     def restarted(self) -> PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
         state = self._restarted_limb() if self.problem.scans == 1 else self.state
-        swung = replace(self, state=state)
-        if self.is_proposed and swung._is_doubtful():
-            return swung._searched_too().restarted()
         costs = self.coarse.cost_of_people(state)
         lead = lead_over_rivals(self.coarse, state, costs) if self._searched else None
         best = self.problem.people(costs.argmin().unsqueeze(0))
@@ -181,23 +186,6 @@ class PersonRows:
     def _descended(self, problem: ShapeProblem, state: Tensor, widths: SigmaSchedule) -> Tensor:
         """Return states (B, D + K) after an annealed EM and a coarse fit to the surface."""
         return self._fit(problem, self._anneal(problem, state, widths).pose, SHAPE_FIT.coarse_steps).pose
-
-    def _is_doubtful(self) -> bool:
-        """Whether the best row leaves clusters of data over, or explains less than half of them."""
-        best = self._best()
-        one = self.coarse.rows(best)
-        explained = one.surface.distance(one.data, self.state[best]).abs() < INLIER_SHARE * one.size
-        few = 2 * (explained & one.valid).sum(-1) < one.valid.sum(-1)
-        return bool(few | leaves_clusters(one, self.state[best]))
-
-    def _searched_too(self) -> PersonRows:
-        """Return the rows together with those of people who are searched for."""
-        data, valid = self.problem.data[:1] + self.problem.origin[:1].unsqueeze(1), self.problem.valid[:1]
-        rows = PersonRows.of_scans(self.task, data, valid, None, proposes=False)
-        state = torch.cat([self.state, replace(rows, history=self.history).annealed().fitted().state])
-        every = torch.zeros(len(state), dtype=torch.int64)
-        problem, coarse = self.problem.rows(every), self.coarse.rows(every)
-        return replace(self, problem=problem, coarse=coarse, state=state, is_proposed=False)
 
     def _restarted_limb(self) -> Tensor:
         """Return states (B, D + K) in one scan, the best with one limb re-initialized where clusters are left over."""
