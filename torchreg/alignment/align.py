@@ -154,7 +154,8 @@ def _aligned(task: Task, data: Any, mask: Tensor | None = None, **keypoints: Any
         rows = rows.annealed()  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
         rows = rows.fitted()  # eqs. 21 and 22: section 3.4
         found = rows.restarted().finished().judged()
-        if isinstance(rows, PersonRows) and rows.is_proposed and float(found.confidence) < CALIBRATION.doubtful:
+        confidence = 1.0 if found.confidence is None else found.confidence
+        if isinstance(rows, PersonRows) and rows.is_proposed and float(confidence) < CALIBRATION.doubtful:
             found = rows.searched_too().restarted().finished().judged()
     person = task.shape if found.coefficients is None else task.shape.with_coefficients(found.coefficients)
     return replace(to_world(found, task.seen.origin), shape=person)
