@@ -96,14 +96,15 @@ def test_a_good_proposal_needs_no_search_and_a_bad_one_is_searched_for(body, sit
     search = person_rows.PersonRows.searched_too
     monkeypatch.setattr(person_rows.PersonRows, "searched_too", lambda rows: searched.append(1) or search(rows))
     vertices = body.vertices(*state.tensor_split([body.num_dofs]))
-    monkeypatch.setattr(person_rows, "shipped_people", lambda shape: told(body, state, points))
-    found = tr.align(body, points, fit_shape=True, clothed=False, config=QUICK)
+    found = tr.align(body, points, fit_shape=True, clothed=False, initializer=told(body, state, points), config=QUICK)
     assert not searched
     assert float((body.vertices(found.pose, found.coefficients) - vertices).norm(dim=-1).mean()) < 0.03
     assert found.evidence is not None
-    monkeypatch.setattr(person_rows, "shipped_people", lambda shape: told(body, state, points, right=False))
-    tr.align(body, points, fit_shape=True, clothed=False, config=QUICK)
+    wrong = told(body, state, points, right=False)
+    tr.align(body, points, fit_shape=True, clothed=False, initializer=wrong, config=QUICK)
     assert searched
+    with pytest.raises(tr.errors.InputError, match="a PersonProposer with fit_shape"):
+        tr.align(body, points, initializer=wrong)
 
 
 def test_training_by_the_one_command_and_files(body, tmp_path, monkeypatch):

@@ -118,12 +118,12 @@ def align(
     """
     config = config or AlignConfig()
     people = initializer if isinstance(initializer, PersonProposer) else None
+    if initializer is not None and (people is None) == (fit_shape is not False):
+        raise InputError("initializer must be a PersonProposer with fit_shape, and a PoseProposer without")
     network = None if isinstance(initializer, PersonProposer) else initializer
     source = StartSource.of(shape, initializer=network, upright=config.upright)
     known, clothed = KnownDofs.of(shape, locked, prior), may_be_clothed(shape, clothed, fit_shape)
     if fit_shape is not False:
-        if initializer is not None and people is None:
-            raise InputError("initializer must be a PersonProposer with fit_shape, as tr.train_initializer returns it")
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and keypoints is None)
     start = shape.pose_from_dict(initial_pose) if isinstance(initial_pose, Mapping) else initial_pose
     task = Task(
