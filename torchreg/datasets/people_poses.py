@@ -127,7 +127,7 @@ class _Angles:
 
     def habits(self, shares: list[float]) -> tuple[Tensor, Tensor]:
         """Return the habits (count,) of the left and the right limb."""
-        weights = torch.tensor(shares).expand(2, -1)
+        weights = torch.tensor(shares, device=self.generator.device).expand(2, -1)
         left, right = torch.multinomial(weights, self.count, replacement=True, generator=self.generator)
         return left, torch.where(self.chance(_TRUNK.alike)[:, 0], left, right)
 
@@ -162,7 +162,9 @@ def _arm(body: ArticulatedShape, draw: _Angles, habit: Tensor) -> dict[str, Tens
     hinge = normalize(torch.linalg.cross(upper, lower), dim=0)
     bent = math.acos(float(upper @ lower))
     kinds = [_arm_of(draw, kind, upper, lower) for kind in _ARMS]
-    raised, elbow = (torch.stack(each)[habit, torch.arange(draw.count)] for each in zip(*kinds, strict=True))
+    raised, elbow = (
+        torch.stack(each)[habit, torch.arange(draw.count, device=habit.device)] for each in zip(*kinds, strict=True)
+    )
     return {"upperarm01": raised, "lowerarm01": so3_exp((elbow - bent) * hinge)}
 
 
@@ -191,7 +193,9 @@ def _leg(draw: _Angles, habit: Tensor) -> dict[str, Tensor]:
         torch.cat([draw.between(limits) for limits in (kind.flexion, kind.abduction, kind.turn, kind.knee)], dim=-1)
         for kind in _LEGS
     ]
-    flexion, abduction, turn, knee = torch.stack(kinds)[habit, torch.arange(draw.count)].split(1, dim=-1)
+    flexion, abduction, turn, knee = torch.stack(kinds)[habit, torch.arange(draw.count, device=habit.device)].split(
+        1, dim=-1
+    )
     hip = so3_exp(pad(-abduction, (1, 1))) @ so3_exp(pad(-flexion, (0, 2))) @ so3_exp(pad(turn, (2, 0)))
     return {"upperleg01": hip, "lowerleg01": so3_exp(pad(knee, (0, 2)))}
 
