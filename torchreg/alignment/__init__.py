@@ -10,7 +10,7 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
   measured keypoints: `MeasuredKeypoints`, `keypoint_skin`;
 - shape coefficients: `fitted_rig`, `scan_normals`, `surface_skins`, `plausible_precision`, `robust_rows`;
-  clothes: `CLOTH`, `clothed_rig`, `may_be_clothed`;
+  clothes: `CLOTH`, `clothed_rig`, `may_be_clothed`; the network that proposes people: `PersonProposer`, `is_body`;
 - what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `near_outlier_share`, `limb_ends`,
   `end_motions`, `end_variances`, `correlated_count`, `neighbor_correlation`,
   `dof_confidence`, `SurfaceError`; in words `spread_of`;

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.annealed_em import OnStep
 from torchreg.alignment.inputs import Task
 from torchreg.alignment.known_dofs import KnownDofs
@@ -21,6 +22,7 @@ from torchreg.alignment.search.landmark_fit import KeypointRows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.alignment.shape.clothing import may_be_clothed
+from torchreg.alignment.shape.person_proposer import PersonProposer
 from torchreg.alignment.shape.person_rows import PersonRows
 from torchreg.alignment.shape.shape_fit import fitted_rig
 from torchreg.capture.depth_frame import DepthFrame
@@ -44,7 +46,7 @@ def align(
     clothed: bool | str = "auto",
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
-    initializer: PoseProposer | HoldsProposer | None = None,
+    initializer: PoseProposer | HoldsProposer | PersonProposer | None = None,
     support: str = "auto",
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
@@ -85,7 +87,8 @@ def align(
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
         keypoint_std: their standard deviation, () or (K,), in metres or pixels; by default 3 % of the shape's size, or
             5 pixels. Beyond three of them a keypoint is taken for wrong.
-        initializer: a network that proposes poses where there is no start, see `find_pose`; the built-in hand has one.
+        initializer: a network that proposes poses where there is no start, see `find_pose`; the built-in hand has one,
+            and anny's body one of people, which counts with ``fit_shape``.
         support: of clouds: "auto" leaves out the table or floor that a scanned thing stands on, see `split_support`, as
             if masked; not where the shape has a flat foot itself. "keep" takes all points for what was given.
         config: see `AlignConfig`.
@@ -114,16 +117,18 @@ def align(
     References: Dewaele et al. 2006, section 3.
     """
     config = config or AlignConfig()
-    source = StartSource.of(shape, initializer=initializer, upright=config.upright)
+    people = initializer if isinstance(initializer, PersonProposer) else None
+    if initializer is not None and (people is None) == (fit_shape is not False):
+        raise InputError("initializer must be a PersonProposer with fit_shape, and a PoseProposer without")
+    network = None if isinstance(initializer, PersonProposer) else initializer
+    source = StartSource.of(shape, initializer=network, upright=config.upright)
     known, clothed = KnownDofs.of(shape, locked, prior), may_be_clothed(shape, clothed, fit_shape)
     if fit_shape is not False:
-        if initializer is not None:
-            raise InputError("initializer has no meaning with fit_shape; people are sought without one")
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and keypoints is None)
     start = shape.pose_from_dict(initial_pose) if isinstance(initial_pose, Mapping) else initial_pose
     task = Task(
         shape=shape, source=source, config=config, model_points=model_points, known=known, start=start,
-        fit_shape=fit_shape is not False, clothed=clothed, support=support, on_step=on_step,
+        fit_shape=fit_shape is not False, people=people, clothed=clothed, support=support, on_step=on_step,
     )  # fmt: skip
     options: dict[str, Any] = {"keypoints": keypoints, "keypoint_std": keypoint_std}
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
@@ -148,8 +153,10 @@ def _aligned(task: Task, data: Any, mask: Tensor | None = None, **keypoints: Any
     with torch.inference_mode(), one_thread(is_small):
         rows = rows.annealed()  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
         rows = rows.fitted()  # eqs. 21 and 22: section 3.4
-        rows = rows.restarted()
-        found = rows.finished().judged()
+        found = rows.restarted().finished().judged()
+        confidence = 1.0 if found.confidence is None else found.confidence
+        if isinstance(rows, PersonRows) and rows.is_proposed and float(confidence) < CALIBRATION.doubtful:
+            found = rows.searched_too().restarted().finished().judged()
     person = task.shape if found.coefficients is None else task.shape.with_coefficients(found.coefficients)
     return replace(to_world(found, task.seen.origin), shape=person)
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from torchreg.alignment.fit.annealed_em import OnStep
     from torchreg.alignment.known_dofs import KnownDofs
     from torchreg.alignment.search.start_source import StartSource
+    from torchreg.alignment.shape.person_proposer import PersonProposer
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,7 @@ class Observation:
 class Task:
     """What `align` or `find_pose` is asked for, see there; ``seen`` follows once a picture is cropped.
 
+    ``people``: the network that proposes them, if another than that of their body.
     ``in_picture``: whether it is sought in a whole picture, of which this is a crop that may show something else.
     """
 
@@ -179,6 +181,7 @@ class Task:
     known: KnownDofs | None = None
     start: Tensor | None = None
     fit_shape: bool = False
+    people: PersonProposer | None = None
     clothed: bool | str = False
     support: str = "keep"
     in_picture: bool = False

@@ -10,13 +10,16 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
 from torchreg.alignment.search.pose_proposer import PoseProposer, ProposerSize, RawPoses, posed_points
+from torchreg.alignment.shape.person_proposer import PersonProposer, RawPeople, is_body
 from torchreg.datasets.cloud_batches import CloudBatch, random_clouds, random_poses
+from torchreg.datasets.people_batches import PeopleBatch, PeopleBatches
 from torchreg.errors import FormatError
 from torchreg.io.limits import local_path
 from torchreg.shapes.articulated import ArticulatedShape
@@ -30,6 +33,7 @@ class _Training:
     surface_points: int = 3000  # of which clouds are drawn
     compared: int = 64  # points by which poses are compared
     width: tuple[float, float] = (0.15, 0.02)  # scale of the errors' distribution, from the first step to the last
+    people_width: tuple[float, float] = (0.015, 0.01)  # the same of people: headings are apart from the start
     surface_weight: float = 1.0  # of what tokens tell, beside the poses
     surface_width: float = 0.05  # error of a token at which its loss turns from squares to absolute values
     warm_up: int = 200  # steps until the full rate
@@ -96,7 +100,7 @@ def train_initializer(
     *,
     size: ProposerSize | None = None,
     progress: Callable[[TrainingRow], None] | None = None,
-) -> PoseProposer:
+) -> PoseProposer | PersonProposer:
     """Train a network that proposes poses of a shape, on made-up clouds; go on where an earlier run ended.
 
     Clouds are one-sided or whole, noisy, with outliers and holes, in any rotation. The loss is the negative logarithm
@@ -132,7 +136,47 @@ def train_initializer(
             if progress is not None:
                 progress(row)
     run.net.save(path, {**asdict(config), "minutes": run.seconds / 60, "steps": run.step})
-    return PoseProposer.load(path, shape)
+    return PoseProposer.load(path, shape) if isinstance(run.net, PoseProposer) else PersonProposer.load(path)
+
+
+class PoseLesson:
+    """Poses of any shape: clouds whose index tells of places (N, 3) at `rest`, and how wrong proposals are."""
+
+    width = _TRAINING.width
+
+    def __init__(self, shape: ArticulatedShape, size: ProposerSize | None) -> None:
+        self.shape, self.net = shape, PoseProposer(shape, size).to(shape.rest.device)
+        self.skin = sample_skin(shape, _TRAINING.surface_points)
+        self.compared = sample_skin(shape, _TRAINING.compared)
+        self.rest = self.skin.points
+
+    def clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
+        """Return clouds, half of them windows of scenes."""
+        poses = random_poses(self.shape, count, generator)
+        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator, in_scenes=True)
+
+    def errors(self, raw: RawPoses, batch: CloudBatch) -> Tensor:
+        """Return the errors (B, K) of the shape's points."""
+        return pose_errors(raw, batch, self.compared, self.net.shape_size)
+
+
+class PersonLesson:
+    """People of a body with coefficients, of all sizes."""
+
+    width = _TRAINING.people_width
+
+    def __init__(self, body: ArticulatedShape, size: ProposerSize | None) -> None:
+        self.net = PersonProposer.of(body, size)
+        self.people = PeopleBatches(body, self.net.marks)
+        self.rest = self.people.rest
+
+    def clouds(self, count: int, generator: torch.Generator) -> PeopleBatch:
+        """Return clouds, bare and clothed."""
+        return self.people.clouds(count, self.net.size.points, generator, self.net.shape_size)
+
+    def errors(self, raw: RawPeople, batch: PeopleBatch) -> Tensor:
+        """Return the errors (B, K) of the marks, as shares of each person's own size."""
+        return (raw.marks - batch.marks.unsqueeze(1)).norm(dim=-1).mean(-1) / batch.sizes.unsqueeze(1)
 
 
 class _Run:
@@ -143,16 +187,17 @@ class _Run:
     ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.checkpoint, self.curve = config, path.with_suffix(".pt"), path.with_suffix(".jsonl")
-        self.shape, device = shape, shape.rest.device
-        self.net = PoseProposer(shape, size).to(device)
+        device = shape.rest.device
+        self.lesson = PersonLesson(shape, size) if is_body(shape) else PoseLesson(shape, size)
+        self.net = self.lesson.net
         self.optimizer = torch.optim.AdamW(self.net.parameters(), lr=config.rate, weight_decay=_TRAINING.decay)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         self.step, self.seconds, self.total = 0, 0.0, torch.zeros((), device=device)
         if self.checkpoint.exists():
             self._resume()
-        self.skin = sample_skin(shape, _TRAINING.surface_points)
-        self.compared = sample_skin(shape, _TRAINING.compared)
-        self.validation = self._clouds(_TRAINING.validation, torch.Generator(device).manual_seed(config.seed + 1))
+        with torch.no_grad():
+            generator = torch.Generator(device).manual_seed(config.seed + 1)
+            self.validation: Any = self.lesson.clouds(_TRAINING.validation, generator)
 
     @property
     def share(self) -> float:
@@ -161,11 +206,13 @@ class _Run:
 
     def advance(self) -> Tensor:
         """Make a step of the optimizer and return the sum of losses since the last validation."""
-        batch = self._clouds(self.config.batch, self.generator)
+        with torch.no_grad():
+            batch: Any = self.lesson.clouds(self.config.batch, self.generator)
         device = batch.points.device.type
         with torch.autocast(device, dtype=torch.bfloat16, enabled=device == "cuda"):
             raw = self.net(batch.points, batch.mask)
-        loss = proposal_loss(raw, batch, self.skin, self.compared, self.net.shape_size, self._width())
+        errors = self.lesson.errors(raw, batch)
+        loss = proposal_loss(raw, batch, errors, self.lesson.rest / self.net.shape_size, self._width())
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate()
         self.optimizer.zero_grad()
@@ -181,7 +228,7 @@ class _Run:
         """Return how the network does on clouds that it is not trained on."""
         self.net.eval()
         raw = self.net(self.validation.points, self.validation.mask)
-        errors = pose_errors(raw, self.validation, self.compared, self.net.shape_size)
+        errors = self.lesson.errors(raw, self.validation)
         self.net.train()
         shown = self.validation.is_shown
         first = errors.gather(1, raw.logits.argmax(1, keepdim=True))[shown].mean()
@@ -217,10 +264,6 @@ class _Run:
         self.step, self.seconds = state["step"], state["seconds"]
         self.generator.set_state(state["generator"].cpu())
 
-    def _clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
-        poses = random_poses(self.shape, count, generator)
-        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator, in_scenes=True)
-
     def _rate(self) -> float:
         """Return the learning rate: a short rise, then half a cosine."""
         rise = min(1.0, (self.step + 1) / _TRAINING.warm_up)
@@ -228,7 +271,7 @@ class _Run:
 
     def _width(self) -> float:
         """Return the scale of the errors' distribution, which narrows in the first half of the training."""
-        first, last = map(math.log, _TRAINING.width)
+        first, last = map(math.log, self.lesson.width)
         return math.exp(first + (last - first) * min(1.0, 2 * self.share))
 
 
@@ -238,18 +281,18 @@ def pose_errors(raw: RawPoses, batch: CloudBatch, compared: LinearBlendSkin, siz
     return (found - truth).norm(dim=-1).mean(-1) / size
 
 
-def proposal_loss(
-    raw: RawPoses, batch: CloudBatch, skin: LinearBlendSkin, compared: LinearBlendSkin, size: float, width: float
-) -> Tensor:
-    """Return the loss () of proposals, see `train_initializer`; ``width`` scales the errors, as a share of the size."""
-    errors = pose_errors(raw, batch, compared, size)
+def proposal_loss(raw: RawPoses | RawPeople, batch: CloudBatch, errors: Tensor, rest: Tensor, width: float) -> Tensor:
+    """Return the loss () of proposals with errors (B, K), see `train_initializer`; ``width`` scales the errors.
+
+    Lengths, those of places (N, 3) at rest too, are shares of the size.
+    """
     likely = torch.logsumexp(raw.logits.log_softmax(-1) - errors / width, dim=-1)
     # In units of the error: the gradient does not grow as the distribution narrows.
     poses = -width * (likely * batch.is_shown).sum() / batch.is_shown.sum().clamp_min(1)
     index = batch.index.gather(1, raw.token_index)
     known = batch.mask.gather(1, raw.token_index)
     inlier = known & (index >= 0)
-    truth = skin.points[index.clamp_min(0)] / size
+    truth = rest[index.clamp_min(0)]
     error = torch.nn.functional.smooth_l1_loss(
         raw.surface[..., :3], truth, reduction="none", beta=_TRAINING.surface_width
     ).sum(-1)

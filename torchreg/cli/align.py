@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from torchreg.alignment.config import AlignConfig
     from torchreg.alignment.results import AlignResult
     from torchreg.alignment.search.pose_proposer import PoseProposer
+    from torchreg.alignment.shape.person_proposer import PersonProposer
     from torchreg.geometry.upright import Direction
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
@@ -211,18 +212,22 @@ class _AlignRun:
     support: str
     clothed: bool | str
     known: Known = field(default_factory=Known)
-    initializer: PoseProposer | None = None
+    initializer: PoseProposer | PersonProposer | None = None
     start: Tensor | None = None
     results: list[AlignResult] = field(default_factory=list)
 
     def prepare(self, start: Path | None, initializer: Path | None, side: str | None, upright: bool) -> None:
         """Read where to start from, and decide in which poses to search."""
+        from torchreg.alignment.shape.person_proposer import PersonProposer, is_body
         from torchreg.geometry.loaded import as_points
         from torchreg.geometry.upright import guess_up
         from torchreg.storage import load_pose
 
         self.start = None if start is None else load_pose(start, self.shape)
-        self.initializer = read_initializer(initializer, self.shape, side)
+        if self.fit_shape and initializer is not None and is_body(self.shape):
+            self.initializer = PersonProposer.load(initializer)
+        else:
+            self.initializer = read_initializer(initializer, self.shape, side)
         self.shape = fitted_shape(self.shape, self.fit_shape)
         if upright:  # where neither --up nor the file say what that is, the first cloud does
             self.config = replace(self.config, upright=self.up or guess_up([as_points(self.read(0))]))

@@ -126,7 +126,7 @@ def random_clouds(
     """
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)
-    draw = _Draw(generator, surface, size, _VARIETY.scene if in_scenes else 0.0)
+    draw = CloudDraw(generator, surface, size, _VARIETY.scene if in_scenes else 0.0)
     forearm = _VARIETY.forearm if isinstance(skin.shape, Hand) else 0.0
     scene = draw.scene(surface, normals, poses[:, :3], forearm)
     visible, slant = draw.visible(scene.points, scene.normals)
@@ -134,12 +134,10 @@ def random_clouds(
     weight = scene.weight * torch.where(whole, 1.0, torch.where(visible, slant, 0.0))
     if in_scenes:
         weight = torch.where(draw.inside(scene, weight, surface.mean(1)), weight, 0.0)
-    # Without replacement, by the largest of the logarithms and Gumbel noise.
-    ranks = weight.log() - draw.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
-    score, index = ranks.topk(min(num_points, ranks.shape[1]), dim=1)
+    drawn, index = draw.picked(weight, num_points)
     points = scene.points.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
     points, outlier = draw.disturbed(points)
-    mask = score.isfinite() & draw.kept(points)
+    mask = drawn & draw.kept(points)
     return CloudBatch(points, mask, poses, torch.where(outlier | (index >= surface.shape[1]), -1, index))
 
 
@@ -157,7 +155,7 @@ class _Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class _Draw:
+class CloudDraw:
     """Draws the differences between clouds of a batch, for a shape of a size in metres, like a tensor."""
 
     generator: torch.Generator
@@ -166,12 +164,24 @@ class _Draw:
     scenes: float  # share of the clouds
 
     def uniform(self, *size: int) -> Tensor:
+        """Return numbers from 0 to 1."""
         return torch.rand(size, generator=self.generator, device=self.generator.device).to(self.like)
 
     def between(self, limits: tuple[float, float], *size: int) -> Tensor:
         """Return numbers whose logarithms are drawn evenly."""
         low, high = map(math.log, limits)
         return (low + (high - low) * self.uniform(*size)).exp()
+
+    def normal(self, *size: int) -> Tensor:
+        """Return numbers of a standard deviation of 1."""
+        return _normal(size, self.generator, self.like)
+
+    def picked(self, weight: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Return points drawn by weights (B, N), their numbers (B, count), and which of them have any weight."""
+        # Without replacement, by the largest of the logarithms and Gumbel noise.
+        ranks = weight.log() - self.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
+        score, index = ranks.topk(min(count, ranks.shape[1]), dim=1)
+        return score.isfinite(), index
 
     def scene(self, surface: Tensor, normals: Tensor, base: Tensor, forearm: float) -> _Scene:
         """Return an object that differs a little from the surface (B, N, 3), and its surroundings."""

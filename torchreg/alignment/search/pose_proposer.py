@@ -83,6 +83,15 @@ class RawPoses(NamedTuple):
     token_index: Tensor
 
 
+class Attended(NamedTuple):
+    """States (B, Q, C) of queries and tokens (B, T, C), the tokens' points (B, T), and the clouds' means (B, 3)."""
+
+    state: Tensor
+    tokens: Tensor
+    token_index: Tensor
+    center: Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class Proposals:
     """Poses (B, K, num_dofs) of a network, most probable first, with weights (B, K).
@@ -97,7 +106,70 @@ class Proposals:
     inlier: Tensor
 
 
-class PoseProposer(nn.Module):
+class CloudNet(nn.Module):
+    """A network of hypotheses that attend to a cloud: the part that `PoseProposer` and `PersonProposer` share.
+
+    Args:
+        size: see `ProposerSize`.
+        shape_size: size of what is sought, metres, by which coordinates are divided.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, size: ProposerSize, shape_size: float) -> None:
+        super().__init__()
+        self.size, self.shape_size, width = size, shape_size, size.width
+        self.register_buffer("frequencies", math.pi * 2.0 ** torch.arange(size.waves), persistent=False)
+        self.around = nn.Sequential(nn.Linear(4, 48), nn.GELU(), nn.Linear(48, width // 2), nn.GELU())
+        self.embed = nn.Sequential(
+            nn.Linear(width // 2 + 3 + 6 * size.waves, width), nn.GELU(), nn.Linear(width, width)
+        )
+        self.encoder = nn.ModuleList(_Block(width, size.heads) for _ in range(size.encoder))
+        self.queries = nn.Parameter(torch.randn(size.hypotheses, width))
+        self.cross = nn.ModuleList(_Block(width, size.heads) for _ in range(size.decoder))
+        self.among = nn.ModuleList(_Block(width, size.heads) for _ in range(size.decoder))
+        self.norm, self.token_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+
+    def attended(self, points: Tensor, mask: Tensor, queries: Tensor) -> Attended:
+        """Return the states of queries (Q, C) and of tokens for clouds (B, M, 3) with a mask (B, M)."""
+        center = masked_mean(points, mask)
+        places = torch.where(mask.unsqueeze(-1), points - center.unsqueeze(1), 0.0) / self.shape_size
+        tokens, known, index = self._tokens(places, mask)
+        for block in self.encoder:
+            tokens = block(tokens, tokens, known)
+        tokens = self.token_norm(tokens)
+        state = queries.expand(points.shape[0], -1, -1)
+        for cross, among in zip(self.cross, self.among, strict=True):
+            state = among(cross(state, tokens, known), None, None)
+        return Attended(self.norm(state), tokens, index, center)
+
+    def fitting(self, points: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return as many points (B, M, 3) with a mask (B, M) as the network takes, of many or few."""
+        short = self.size.neighbors - points.shape[1]
+        if points.shape[1] > self.size.points:
+            index = _drawn(points, mask, self.size.points)
+            return _rows(points, index), mask.gather(1, index)
+        if short > 0:
+            return nn.functional.pad(points, (0, 0, 0, short)), nn.functional.pad(mask, (0, short))
+        return points, mask
+
+    def _tokens(self, places: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return descriptions (B, T, C) of drawn points, which of them are points (B, T), and their numbers (B, T)."""
+        index = _drawn(places, mask, self.size.tokens)
+        known = mask.gather(1, index)
+        centers = _rows(places, index)
+        distance = torch.cdist(centers, places).masked_fill(~mask.unsqueeze(1), torch.inf)
+        near, neighbor = distance.topk(self.size.neighbors, dim=2, largest=False)
+        there = _rows(places, neighbor.flatten(1)).unflatten(1, neighbor.shape[1:]) - centers.unsqueeze(2)
+        there = torch.where(near.isfinite().unsqueeze(-1), there, 0.0)
+        # Surroundings of a tenth of the shape fill the range of a network's inputs.
+        around = self.around(10 * torch.cat([there, there.norm(dim=-1, keepdim=True)], dim=-1)).amax(2)
+        waves = (centers.unsqueeze(-1) * self.frequencies).flatten(2)
+        state = self.embed(torch.cat([around, centers, waves.sin(), waves.cos()], dim=-1))
+        return state, known, index
+
+
+class PoseProposer(CloudNet):
     """Proposes poses of a shape for a batch of clouds: one pass of a network, no search.
 
     Tokens are points with what lies around them; hypotheses attend to them. The poses are as good as a coarse fit
@@ -120,18 +192,16 @@ class PoseProposer(nn.Module):
     lower: Tensor
     upper: Tensor
     rest: Tensor
-    frequencies: Tensor
 
     def __init__(
         self, shape: Articulation, size: ProposerSize | None = None, *, shape_size: float | None = None
     ) -> None:
-        super().__init__()
-        self.size = size or ProposerSize()
+        size = size or ProposerSize()
+        super().__init__(size, model_size(sample_skin(shape)) if shape_size is None else shape_size)
         self.dof_names = tuple(shape.dof_names)
         self.keypoints = shape.keypoints(shape.rest_pose()).detach().double().cpu()
-        self.shape_size = model_size(sample_skin(shape)) if shape_size is None else shape_size
         self.mirrored = False
-        width, joints = self.size.width, shape.num_dofs - BASE_DOFS
+        width, joints = size.width, shape.num_dofs - BASE_DOFS
         rest = shape.rest[BASE_DOFS:].detach().float()
         lower, upper = shape.lower[BASE_DOFS:].detach().float(), shape.upper[BASE_DOFS:].detach().float()
         wide = (upper - lower).isinf() | (upper - lower > 2 * _OPEN)
@@ -139,18 +209,8 @@ class PoseProposer(nn.Module):
             ("lower", torch.where(wide, rest - _OPEN, lower)),
             ("upper", torch.where(wide, rest + _OPEN, upper)),
             ("rest", rest),
-            ("frequencies", math.pi * 2.0 ** torch.arange(self.size.waves)),
         ):
             self.register_buffer(name, value.clone(), persistent=False)
-        self.around = nn.Sequential(nn.Linear(4, 48), nn.GELU(), nn.Linear(48, width // 2), nn.GELU())
-        self.embed = nn.Sequential(
-            nn.Linear(width // 2 + 3 + 6 * self.size.waves, width), nn.GELU(), nn.Linear(width, width)
-        )
-        self.encoder = nn.ModuleList(_Block(width, self.size.heads) for _ in range(self.size.encoder))
-        self.queries = nn.Parameter(torch.randn(self.size.hypotheses, width))
-        self.cross = nn.ModuleList(_Block(width, self.size.heads) for _ in range(self.size.decoder))
-        self.among = nn.ModuleList(_Block(width, self.size.heads) for _ in range(self.size.decoder))
-        self.norm, self.token_norm = nn.LayerNorm(width), nn.LayerNorm(width)
         last = nn.Linear(width, 6 + 3 + joints + 1)
         self.head = nn.Sequential(nn.Linear(width, width), nn.GELU(), last)
         self.surface = nn.Linear(width, 4)
@@ -162,16 +222,8 @@ class PoseProposer(nn.Module):
 
     def forward(self, points: Tensor, mask: Tensor) -> RawPoses:
         """Return poses, see the class."""
-        center = masked_mean(points, mask)
-        places = torch.where(mask.unsqueeze(-1), points - center.unsqueeze(1), 0.0) / self.shape_size
-        tokens, known, index = self._tokens(places, mask)
-        for block in self.encoder:
-            tokens = block(tokens, tokens, known)
-        tokens = self.token_norm(tokens)
-        state = self.queries.expand(points.shape[0], -1, -1)
-        for cross, among in zip(self.cross, self.among, strict=True):
-            state = among(cross(state, tokens, known), None, None)
-        out = self.head(self.norm(state)).float()
+        state, tokens, index, center = self.attended(points, mask, self.queries)
+        out = self.head(state).float()
         turn, position, joints, logits = out.split((6, 3, len(self.rest), 1), dim=-1)
         share = (joints + self._rest_logit()).sigmoid()
         return RawPoses(
@@ -191,12 +243,7 @@ class PoseProposer(nn.Module):
             points: (B, M, 3), metres; of any floating dtype.
             mask: (B, M), False where points are padding.
         """
-        short = self.size.neighbors - points.shape[1]
-        if points.shape[1] > self.size.points:
-            index = _drawn(points, mask, self.size.points)
-            points, mask = _rows(points, index), mask.gather(1, index)
-        elif short > 0:
-            points, mask = nn.functional.pad(points, (0, 0, 0, short)), nn.functional.pad(mask, (0, short))
+        points, mask = self.fitting(points, mask)
         # A mirror across x; turns are axial.
         flip = points.new_tensor([-1.0 if self.mirrored else 1.0, 1.0, 1.0])
         raw = self((points * flip).to(self.queries), mask)
@@ -258,21 +305,6 @@ class PoseProposer(nn.Module):
         """Return what the sigmoid takes to the rest pose, or near it where that is at a limit."""
         share = (self.rest - self.lower) / (self.upper - self.lower).clamp_min(1e-6)
         return share.clamp(0.1, 0.9).logit()
-
-    def _tokens(self, places: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return descriptions (B, T, C) of drawn points, which of them are points (B, T), and their numbers (B, T)."""
-        index = _drawn(places, mask, self.size.tokens)
-        known = mask.gather(1, index)
-        centers = _rows(places, index)
-        distance = torch.cdist(centers, places).masked_fill(~mask.unsqueeze(1), torch.inf)
-        near, neighbor = distance.topk(self.size.neighbors, dim=2, largest=False)
-        there = _rows(places, neighbor.flatten(1)).unflatten(1, neighbor.shape[1:]) - centers.unsqueeze(2)
-        there = torch.where(near.isfinite().unsqueeze(-1), there, 0.0)
-        # Surroundings of a tenth of the shape fill the range of a network's inputs.
-        around = self.around(10 * torch.cat([there, there.norm(dim=-1, keepdim=True)], dim=-1)).amax(2)
-        waves = (centers.unsqueeze(-1) * self.frequencies).flatten(2)
-        state = self.embed(torch.cat([around, centers, waves.sin(), waves.cos()], dim=-1))
-        return state, known, index
 
 
 class _Block(nn.Module):

@@ -22,6 +22,7 @@ from torchreg.alignment.shape.clothing import CLOTH, clothed_rig
 from torchreg.alignment.shape.clothing_evidence import are_clothes_likelier
 from torchreg.alignment.shape.person_covariance import noise_covariance, shared_covariance
 from torchreg.alignment.shape.person_gradient import person_with_gradients
+from torchreg.alignment.shape.person_proposer import shipped_people
 from torchreg.alignment.shape.person_search import lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_fit import (
     SHAPE_FIT,
@@ -39,7 +40,7 @@ class PersonRows:
     """States (S T, D + K) of S people in T scans that share coefficients, in the end of the best person.
 
     They solve `coarse`, a sample of the data of `problem`; `sigma` (1,) is the last kernel width of the EM and `lead`
-    (1,) the cost by which the best different state is worse in a search.
+    (1,) the cost by which the best different state is worse in a search; those that a network proposed are so told.
     """
 
     task: Task
@@ -49,6 +50,7 @@ class PersonRows:
     generator: torch.Generator
     sigma: Tensor
     lead: Tensor | None = None
+    is_proposed: bool = False
     history: list[AlignRecord] = field(default_factory=list)
 
     @classmethod
@@ -71,14 +73,28 @@ class PersonRows:
 
     @classmethod
     @torch.inference_mode()
-    def of_scans(cls, task: Task, data: Tensor, valid: Tensor, poses: Tensor | None) -> PersonRows:
+    def of_scans(
+        cls, task: Task, data: Tensor, valid: Tensor, poses: Tensor | None, *, proposes: bool = True
+    ) -> PersonRows:
         """Return the rows of one person in T scans (T, M, 3), with poses (T, num_dofs) at the mean coefficients."""
         shape, config, generator = task.shape, task.config, torch.Generator().manual_seed(task.config.seed)
         views = [frame.camera.position for frame in task.seen.frames]
         viewpoints = torch.stack(views) if views else None
-        problem, start = shape_problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
+        proposer = (task.people or shipped_people(shape)) if poses is None and proposes else None
+        problem, start = shape_problem(
+            shape, data, valid, poses, viewpoints, config=config, generator=generator, proposer=proposer
+        )
         coarse = problem.draw(SHAPE_FIT.coarse_data, generator)
-        return cls(task, problem, coarse, start, generator, sigma=start[:1, 0])
+        return cls(task, problem, coarse, start, generator, start[:1, 0], is_proposed=proposer is not None)
+
+    def searched_too(self) -> PersonRows:
+        """Return the fitted rows that a network proposed together with those of people searched for in the one scan."""
+        data, valid = self.problem.data[:1] + self.problem.origin[:1].unsqueeze(1), self.problem.valid[:1]
+        rows = PersonRows.of_scans(self.task, data, valid, None, proposes=False)
+        state = torch.cat([self.state, replace(rows, history=self.history).annealed().fitted().state])
+        every = torch.zeros(len(state), dtype=torch.int64)
+        problem, coarse = self.problem.rows(every), self.coarse.rows(every)
+        return replace(self, problem=problem, coarse=coarse, state=state, is_proposed=False)
 
     def record(self, step: AlignRecord) -> None:
         """Keep the record of a step and pass it on, with the poses alone, in the coordinates of the data."""
@@ -90,7 +106,13 @@ class PersonRows:
             self.task.on_step(step)
 
     def annealed(self) -> PersonRows:
-        """Return the best rows after an annealed EM, with normals, which registers shapes of different sizes."""
+        """Return the best rows after an annealed EM, with normals, which registers shapes of different sizes.
+
+        People proposed by a network have about their size: they are fitted alone, and all are kept as rivals.
+        """
+        if self.is_proposed:
+            state = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps).pose
+            return replace(self, state=state, sigma=torch.full_like(self.sigma, ANNEALING.stop * self.problem.size))
         widths = self.task.config.schedule or ANNEALING.schedule(self.problem.size, SHAPE_FIT.em_steps)
         found = self._anneal(self.coarse, self.state, widths)
         count = SHAPE_FIT.num_found_kept if self._searched else SHAPE_FIT.num_kept
@@ -100,10 +122,21 @@ class PersonRows:
 
     def fitted(self) -> PersonRows:
         """Return the rows fitted to the surface, and again after a narrower annealing, where that explains more."""
-        state = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps).pose
-        again = self._descended(self.coarse, state, self._narrow)
-        better = self.coarse.cost_of_people(again) < self.coarse.cost_of_people(state)
-        return replace(self, state=torch.where(better.repeat_interleave(self.coarse.scans).unsqueeze(-1), again, state))
+        if not self.is_proposed:
+            state = self._fit(self.coarse, self.state, SHAPE_FIT.coarse_steps).pose
+            return replace(self, state=self._again(self.coarse, state))
+        best = self._best()
+        again = self._again(self.coarse.rows(best), self.state[best])
+        return replace(self, state=self.state.index_copy(0, best, again))
+
+    def _again(self, problem: ShapeProblem, state: Tensor) -> Tensor:
+        again = self._descended(problem, state, self._narrow)
+        better = problem.cost_of_people(again) < problem.cost_of_people(state)
+        return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), again, state)
+
+    def _best(self) -> Tensor:
+        """Return the index (1,) of the best row of one scan."""
+        return self.coarse.cost_of_people(self.state).argmin().unsqueeze(0)
 
     def restarted(self) -> PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
@@ -164,7 +197,7 @@ class PersonRows:
             return state
         limbs = limb_restarts(one, state[best[0]], SHAPE_FIT.num_swung, self.generator)
         others = [(limbs, self._narrow)] if len(limbs) else []  # a chain without branches has no limb to swing
-        if self._searched:
+        if self._searched and not self.is_proposed:
             others.append((rotation_restarts(one, state[best[0]]), ANNEALING.schedule(size, SHAPE_FIT.em_steps)))
         if not others:
             return state

@@ -16,6 +16,7 @@ from torchreg.alignment.fit.problem import joint_precision, masked_mean, model_s
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.shape.clothing import ClothedSpace
 from torchreg.alignment.shape.person_covariance import noise_covariance, with_errors_of_parts
+from torchreg.alignment.shape.person_proposer import PersonProposer
 from torchreg.alignment.shape.person_search import find_people
 from torchreg.alignment.shape.shape_problem import ShapeProblem
 from torchreg.errors import InputError
@@ -23,7 +24,6 @@ from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
-from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
@@ -42,6 +42,7 @@ class ShapeFit:
     num_starts: int = 6  # sizes of a body are an octave apart, and the annealed EM finds its way over a tenth
     num_kept: int = 2  # starts that are still fitted to the surface
     num_found: int = 8  # starts that a search without a given one hands on: sizes and turned people
+    num_proposed: int = 4  # starts that a network hands on: front and back, or of two limbs either
     num_found_kept: int = 3  # of those: the back of a person looks much like its front
     coarse_data: int = 1000  # of each scan, by which starts are told apart
     fine_data: int = 1500  # of each scan, before all of them count
@@ -150,12 +151,22 @@ def shape_problem(
     *,
     config: AlignConfig,
     generator: torch.Generator,
+    proposer: PersonProposer | None = None,
 ) -> tuple[ShapeProblem, Tensor]:
-    """Return the problem of S people in T scans, S T rows about the scans' means, and its start."""
+    """Return the problem of S people in T scans, S T rows about the scans' means, and its start.
+
+    Without poses people are found in the one scan, by a network if there is one.
+    """
     if poses is None:
         rest = shape.rest_pose().unsqueeze(0)
         problem, start = shape_problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
-        return _found(problem, shape, start[:, shape.num_dofs :], generator, config.upright)
+        one = problem.rows(torch.zeros(1, dtype=torch.int64)).draw(SHAPE_FIT.coarse_data, generator)
+        if proposer is not None:
+            states = proposer.propose(one, shape.file_surface(), SHAPE_FIT.num_proposed, generator, config.upright)
+        else:
+            people = start[:, shape.num_dofs :]
+            states = find_people(one, shape, people, SHAPE_FIT.num_found, generator, config.upright)
+        return problem.rows(torch.zeros(len(states), dtype=torch.int64)), states
     space, surface = shape.coefficient_space(), shape.file_surface()
     people = different_people(space.body if isinstance(space, ClothedSpace) else space, generator)
     people = torch.cat([people, space.mean[people.shape[-1] :].expand(len(people), -1)], dim=-1)
@@ -180,15 +191,6 @@ def shape_problem(
         scans=scans,
     )  # fmt: skip
     return problem, start
-
-
-def _found(
-    problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator, upright: Direction | None
-) -> tuple[ShapeProblem, Tensor]:
-    """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
-    one = problem.rows(torch.zeros(1, dtype=torch.int64)).draw(SHAPE_FIT.coarse_data, generator)
-    states = find_people(one, rig, people, SHAPE_FIT.num_found, generator, upright)
-    return problem.rows(torch.zeros(len(states), dtype=torch.int64)), states
 
 
 def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:
