@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchreg.alignment.evidence.clusters import CLUSTERS
-from torchreg.alignment.evidence.confidence import EVIDENCE
 from torchreg.alignment.evidence.picture_agreement import visible_points
 from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
@@ -82,7 +81,7 @@ def unseen_share(fit: FrameFit) -> Tensor:
     if not bool(near.any()) or not bool(visible.any()):
         return torch.ones_like(fit.residual)
     apart = NeighborTree(problem.data[0, near]).nearest(posed[visible])[1]
-    return (apart > EVIDENCE.tolerance * problem.size).to(posed).mean()
+    return (apart > 2 * INLIER_SHARE * problem.size).to(posed).mean()
 
 
 def deviates_far(fit: FrameFit, state: TrackState) -> bool:
