@@ -46,7 +46,7 @@ from torchreg.shapes.robots import solid_mesh
 STEP, SPLITS = 0.25, 3
 # Of clouds all around: points each, and joint angles at random up to so much, radians.
 POINTS, RANGE = 5000, 0.8
-# Robots of others that nothing was developed on: two arms, two quadrupeds, a hand.
+# Robots of others: two arms, two quadrupeds, a hand.
 STRANGERS = {name: ROBOTS[name] for name in ("UR5", "Panda", "A1", "Allegro")} | {
     "solo12": "solo_description/robots/solo12.urdf"
 }
