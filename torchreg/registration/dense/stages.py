@@ -18,6 +18,8 @@ from torchreg.registration.dense.problem import ScanAlignProblem
 
 # Stds beyond which the expectation no longer tells where a sample is: of a Gaussian three in a hundred lie there.
 _FAR_OFF = 3.0
+# Tokens of a limb, which are wrong together where they are: they count as one.
+_ALIKE = 30
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,8 @@ class Reporter:
 def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Tensor:
     """Return motions refined by EM: sigma shrinks, and the graph softens.
 
-    Samples on a surface tell little of where they lie along it: there the matches of the tokens count beside theirs, as
-    much less as their sigma, at which the coarse EM ends, is larger.
+    Samples on a surface tell little of where they lie along it: there the matches of the tokens count too, by the sigma
+    at which the coarse EM ends.
     """
     config, plan, coarse = problem.config, problem.config.refine, problem.config.coarse.sigma[1]
     for step in range(plan.num_steps):
@@ -68,9 +70,9 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
         matches = GraphMatches(
             slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
         )
-        tokens = match_tokens(problem, transforms, coarse, 1.0)
-        # Each is chosen by two. Neighboring tokens err alike: they count as little as samples along the surface do.
-        weight = config.tangential_weight * (sigma / coarse) ** 2
+        tokens = match_tokens(problem, transforms, coarse, 1 / (1 + config.outliers))
+        # Each is chosen from both sides.
+        weight = (sigma / coarse) ** 2 / _ALIKE
         tokens = replace(tokens, weights=0.5 * tokens.weights, tangential_weight=weight)
         fit = fit_graph(problem.graph, transforms, [matches, tokens], stiffness, edge_scale=config.edge_scale)
         transforms = fit.transforms
