@@ -135,7 +135,7 @@ def align(
             asked = replace(task, model_points=skin, config=config, start=start, in_picture=True)
             return _aligned(asked, crop, **options)
 
-        return align_in_picture(data, skin, aligned, config, source.proposer)
+        return align_in_picture(data, skin, aligned, config, source.with_known(known))
     return _aligned(task, data, mask, **options)
 
 
