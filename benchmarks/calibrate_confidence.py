@@ -172,18 +172,20 @@ def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
     In a room, poses from a network's start have no rivals: they choose a crop, and what they find is judged again.
     """
     told = [case for case in cases if not case.in_room or case.told[2] is not None]
-    return by_family([case for case in told if case.in_room]) | by_family([case for case in told if not case.in_room])
+    rooms = by_family([case for case in told if case.in_room], reliability.PICTURE_CALIBRATION)
+    return rooms | by_family([case for case in told if not case.in_room])
 
 
-def by_family(cases: Sequence[Judged]) -> dict[str, Calibration]:
+def by_family(cases: Sequence[Judged], before: Calibration | None = None) -> dict[str, Calibration]:
     """Return a model of each family: the weights are those of all, the bias is its own.
 
-    A family's bias is off the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
+    Of rooms, the model fitted to those ``before`` is moved. A family's bias is off the common one by a normal deviate
+    of `BIAS_STD`, so that few cases change little.
     """
     if not cases:
         return {}
     table, right = torch.stack([case.evidence for case in cases if case.evidence is not None]).double(), rights(cases)
-    common, found = fit_logistic(table, right), {}
+    common, found = fit_logistic(table, right, before=before), {}
     for family in dict.fromkeys(case.family for case in cases):
         chosen = torch.tensor([case.family == family for case in cases])
         offsets = torch.linspace(-4, 4, 161, dtype=torch.float64).unsqueeze(-1)
