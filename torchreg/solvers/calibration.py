@@ -31,7 +31,7 @@ class _Fit:
     ridge: float = 0.0015  # of squared weights, relative to the mean log-likelihood
     steps: int = 200  # of the optimizer, at most
     start: float = 0.5  # of all weights
-    moved: float = 1.0  # standard deviation of bias and weights about those of a model that is known before, log-odds
+    moved: float = 2.0  # standard deviation of bias and weights about those of a model that is known before, log-odds
 
 
 _FIT = _Fit()
