@@ -26,7 +26,6 @@ class Choice:
 
     shown: float = PICTURE_MODEL.told  # probability that a crop shows the shape from which on no other crop is tried
     missed: float = 0.05  # the same of all crops that are left, below which none of them is tried: the level of a test
-    likely: float = 0.5  # the same, from which on a crop is searched in which no pose found quickly is likely
     not_found: float = 0.05  # below which the best pose is rejected, at the usual level of a test
 
 
@@ -56,8 +55,7 @@ def align_in_picture(
         return aligned(crop.frame, config=quick if crop.is_quick else config, start=crop.start)
 
     found, crop = surest_crop(frame, skin, answer, source)
-    is_likely = _shown(found) >= CHOICE.likely or _confidence(found) >= CHOICE.not_found
-    if crop.is_quick and is_likely:
+    if crop.is_quick and (_odds(found, crop) >= 1 or _confidence(found) >= CHOICE.not_found):
         if source.proposer is not None:
             crop = replace(crop, frame=crop_about(frame, skin, source.proposer, found.pose) or crop.frame)
         found = aligned(crop.frame, config=config)
@@ -103,8 +101,11 @@ def _not_found_if_improbable(found: AlignResult) -> AlignResult:
 
 def _worth(found: Any, crop: LikelyCrop) -> float:
     """Return by what crops are compared: the odds of the better pose in a network's window, or the confidence."""
-    if crop.start is None or not isinstance(found, AlignResult):
-        return _confidence(found)
+    return _confidence(found) if crop.start is None or not isinstance(found, AlignResult) else _odds(found, crop)
+
+
+def _odds(found: Any, crop: LikelyCrop) -> float:
+    """Return the odds that a crop shows the shape, by its own pose or the one found, whichever is better."""
     shown = min(_shown(found), 1 - torch.finfo(torch.float32).eps)
     return max(crop.odds, shown / (1 - shown))
 
