@@ -28,7 +28,7 @@ def test_few_cases_move_a_model_little_and_many_all_the_way():
     evidence = torch.rand(4000, 1, generator=torch.Generator().manual_seed(0))
     right = torch.rand(4000, generator=torch.Generator().manual_seed(1)) < truth.probability(evidence)
     found = [fit_logistic(evidence[:count], right[:count], before=before) for count in (1, 40, 400, 4000)]
-    assert found[0].weights == pytest.approx(before.weights, abs=0.5)
+    assert found[0].weights == pytest.approx(before.weights, abs=1.0)  # half the deviation of the prior
     assert found[0].weights < found[1].weights < found[2].weights < found[3].weights
     assert found[3].weights == pytest.approx(truth.weights, abs=0.6)
 
