@@ -85,8 +85,8 @@ class Judged:
         return float(self.told[0].size)
 
 
-def recorded(align: Callable[[], tr.AlignResult]) -> list[tuple[Any, ...]]:
-    """Return what each judgement of an alignment was given, the answer's last."""
+def recorded(align: Callable[[], tr.AlignResult]) -> tuple[list[tuple[Any, ...]], tr.AlignResult]:
+    """Return what each judgement of an alignment was given, and the answer."""
     calls = []
 
     def judge(problem: Any, pose: Tensor, lead: Any, error: Any, *told: Any) -> Any:
@@ -95,8 +95,7 @@ def recorded(align: Callable[[], tr.AlignResult]) -> list[tuple[Any, ...]]:
 
     with patch.object(pose_rows, "judge", judge), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        align()
-    return calls
+        return calls, align()
 
 
 def world_pose(told: tuple[Any, ...]) -> Tensor:
@@ -106,21 +105,22 @@ def world_pose(told: tuple[Any, ...]) -> Tensor:
 def in_rooms(kind: str, seed: int, there: bool) -> Iterator[Judged]:
     """Yield all judgements of a room."""
     scene = KINDS[kind](seed, there)
-    calls = recorded(lambda: tr.align(scene.shape, scene.frame))
+    calls, found = recorded(lambda: tr.align(scene.shape, scene.frame))
     for told in calls:
         pose, ends = world_pose(told), None
         if there and scene.keypoints is not None:
             ends = (scene.shape.keypoints(pose) - scene.keypoints)[4::4].norm(dim=-1)
         yield Judged(
             kind=f"room, {kind}", family=ROOM_FAMILIES[kind], seed=seed, told=told, ends=ends,
-            right=scene.is_right(pose), near=scene.is_near(pose, told[0].size), is_answer=told is calls[-1],
+            right=scene.is_right(pose), near=scene.is_near(pose, told[0].size),
+            is_answer=torch.allclose(pose, found.pose),
         )  # fmt: skip
 
 
 def alone(thing: Subject, seed: int) -> Iterator[Judged]:
     """Yield the judgement of a cloud or cut picture of one shape."""
     drawn = Drawn.of(thing, seed)
-    calls = recorded(lambda: tr.align(thing.shape, drawn.data, drawn.start, model_points=thing.skin))
+    calls, _ = recorded(lambda: tr.align(thing.shape, drawn.data, drawn.start, model_points=thing.skin))
     pose = world_pose(calls[-1])
     ends = drawn.end_errors(thing, pose)
     right = float(ends.mean()) <= reliability.CALIBRATION.right * thing.size
@@ -172,18 +172,20 @@ def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
     In a room, poses from a network's start have no rivals: they choose a crop, and what they find is judged again.
     """
     told = [case for case in cases if not case.in_room or case.told[2] is not None]
-    return by_family([case for case in told if case.in_room]) | by_family([case for case in told if not case.in_room])
+    rooms = by_family([case for case in told if case.in_room], reliability.PICTURE_CALIBRATION)
+    return rooms | by_family([case for case in told if not case.in_room])
 
 
-def by_family(cases: Sequence[Judged]) -> dict[str, Calibration]:
+def by_family(cases: Sequence[Judged], before: Calibration | None = None) -> dict[str, Calibration]:
     """Return a model of each family: the weights are those of all, the bias is its own.
 
-    A family's bias is off the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
+    Of rooms, the model fitted to those ``before`` is moved. A family's bias is off the common one by a normal deviate
+    of `BIAS_STD`, so that few cases change little.
     """
     if not cases:
         return {}
     table, right = torch.stack([case.evidence for case in cases if case.evidence is not None]).double(), rights(cases)
-    common, found = fit_logistic(table, right), {}
+    common, found = fit_logistic(table, right, before=before), {}
     for family in dict.fromkeys(case.family for case in cases):
         chosen = torch.tensor([case.family == family for case in cases])
         offsets = torch.linspace(-4, 4, 161, dtype=torch.float64).unsqueeze(-1)

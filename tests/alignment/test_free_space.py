@@ -8,7 +8,7 @@ from tests.alignment.conftest import CAMERA
 from tests.alignment.made import problem_of
 from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
 from torchreg.alignment.fit.problem import alignment_cost
-from torchreg.capture.depth_segments import beyond_cut, candidate_crops
+from torchreg.capture.depth_segments import SurfaceGrid, beyond_cut, candidate_crops
 
 
 def problems_of(skin, pose, frame):
@@ -78,8 +78,13 @@ def scene():
     return tr.DepthFrame(depth, CAMERA)
 
 
+def crops_of(frame, size):
+    grid = SurfaceGrid.of(frame, size).without_planes(size)
+    return [frame.cropped(grid.mask(kept)) for kept in candidate_crops(grid, size)]
+
+
 def test_crops_are_the_ends_of_the_nearest_surface_first_but_no_large_planes():
-    crops = list(candidate_crops(scene(), 0.2))
+    crops = crops_of(scene(), 0.2)
     first, second = crops[:2]
     assert float(first.points[:, 2].max()) == 1.0
     column = first.pixels[:, 0]
@@ -88,14 +93,14 @@ def test_crops_are_the_ends_of_the_nearest_surface_first_but_no_large_planes():
     assert int(second.pixels[:, 0].max()) == 95
     assert all(float(crop.points[:, 2].max()) == 1.0 for crop in crops)  # a wall is larger than the shape
     wall = tr.DepthFrame(torch.full((72, 96), 2.0, dtype=torch.float64), CAMERA)
-    assert not list(candidate_crops(wall, 0.2))
+    assert not crops_of(wall, 0.2)
 
 
 def test_surfaces_near_each_other_are_one_crop_before_each_of_them():
     depth = torch.full((72, 96), 2.0, dtype=torch.float64)
     depth[25:45, 30:42], depth[25:45, 42:54] = 1.0, 1.06  # two parts of 11 cm, one before the other
     depth[25:45, 80:90] = 1.05
-    both, *single = candidate_crops(tr.DepthFrame(depth, CAMERA), 0.4)
+    both, *single = crops_of(tr.DepthFrame(depth, CAMERA), 0.4)
     assert int(both.pixels[:, 0].min()) == 30
     assert int(both.pixels[:, 0].max()) == 53
     assert [sorted({round(float(z), 2) for z in crop.points[:, 2]}) for crop in single] == [[1.0], [1.05], [1.06]]

@@ -23,6 +23,16 @@ def test_the_model_is_that_by_which_the_cases_were_drawn(weighted):
     torch.testing.assert_close(found.log_odds(evidence).sigmoid(), found.probability(evidence))
 
 
+def test_few_cases_move_a_model_little_and_many_all_the_way():
+    before, truth = Logistic(1.0, (1.0,)), Logistic(3.0, (5.0,))
+    evidence = torch.rand(4000, 1, generator=torch.Generator().manual_seed(0))
+    right = torch.rand(4000, generator=torch.Generator().manual_seed(1)) < truth.probability(evidence)
+    found = [fit_logistic(evidence[:count], right[:count], before=before) for count in (1, 40, 400, 4000)]
+    assert found[0].weights == pytest.approx(before.weights, abs=1.0)  # half the deviation of the prior
+    assert found[0].weights < found[1].weights < found[2].weights < found[3].weights
+    assert found[3].weights == pytest.approx(truth.weights, abs=0.6)
+
+
 def test_evidence_that_speaks_for_what_it_should_speak_against_has_no_weight():
     evidence = torch.rand(500, 1, generator=torch.Generator().manual_seed(0))
     assert fit_logistic(evidence, evidence[:, 0] > 0.5).weights == (pytest.approx(0, abs=0.02),)

@@ -60,7 +60,7 @@ def align(
         shape: the articulated shape, in metres.
         data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds. Or a
             `DepthFrame`, whose free space counts too, or a sequence of B of them. In a single frame without a mask and
-            without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first;
+            without a start, surfaces of about the shape's size, and ends of larger ones, are tried, likeliest first;
             the status is NOT_FOUND where the best pose is wrong with 95 %: it is not there, or the search missed it.
             None, or the `Camera` of keypoints in pixels, where keypoints are all there is.
         initial_pose: (num_dofs,) start, or numbers by name of degree of freedom with the others at rest, moved inside
@@ -140,7 +140,7 @@ def align(
             asked = replace(task, model_points=skin, config=config, start=start, in_picture=True)
             return _aligned(asked, crop, **options)
 
-        return align_in_picture(data, skin, aligned, config, source.proposer)
+        return align_in_picture(data, skin, aligned, config, source.with_known(known))
     return _aligned(task, data, mask, **options)
 
 

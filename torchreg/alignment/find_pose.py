@@ -29,7 +29,7 @@ from torchreg.alignment.search.landmark_fit import KeypointRows, find_keypoints
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, align_rows
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.pose_search import PoseSearch
-from torchreg.alignment.search.rough_poses import PoseSource, register_rigidly, typical_poses
+from torchreg.alignment.search.rough_poses import PoseSource, typical_poses
 from torchreg.alignment.search.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
@@ -154,7 +154,7 @@ def find_pose(
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = task.skin()
         task = replace(task, model_points=skin)
-        return surest_crop(data, skin, lambda crop: found(crop.frame), source.proposer)[0]
+        return surest_crop(data, skin, lambda crop: found(crop.frame), source.with_known(known))[0]
     return found(data, mask)
 
 
@@ -245,7 +245,7 @@ def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, 
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = source.rough(search.problem, generator)
-    ranked = Candidates.ranked(search.problem, *register_rigidly(search.problem, rough, generator))
+    ranked = search.registered(rough, generator)
     if isinstance(problem.surface, SkinSurface):
         rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.same, config.num_placed).poses], dim=1)
         aligned = align_rows(problem, rough, config.num_searched, generator)

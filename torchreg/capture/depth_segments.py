@@ -112,26 +112,22 @@ class SurfaceGrid:
         return full.to(self.frame.depth.device) & self.frame.measured
 
 
-def candidate_crops(frame: DepthFrame, size: float) -> Iterator[DepthFrame]:
-    """Yield the crops of a frame that may show a shape of some size, metres: nearer ones first, joined ones before all.
+def candidate_crops(grid: SurfaceGrid, size: float) -> Iterator[Tensor]:
+    """Yield the nodes (V,) of a grid that may show a shape of some size, metres: nearer first, joined before all.
 
     Surfaces next to each other that are no larger together are one crop: a shape hides parts of itself. Then a surface
     of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach of an
-    end, along the surface. Planes that are larger than the shape show something else.
+    end, along the surface. Planes that are larger than the shape show something else, see `without_planes`.
     """
-    grid = SurfaceGrid.of(frame, size).without_planes(size)
-    if not len(grid.points):
-        return
     component = grid.graph.components().to(grid.points.device)
     group = _joined(grid.points, component, size)
     is_joined = group != component
     is_joined |= torch.isin(component, group[is_joined])
     for number, index in _nearest_first(grid, group, size):
         if bool(is_joined[index].any()):
-            yield frame.cropped(grid.mask(group == number))
+            yield group == number
     for _, index in _nearest_first(grid, component, size):
-        for kept in _parts(grid, index, size):
-            yield frame.cropped(grid.mask(kept))
+        yield from _parts(grid, index, size)
 
 
 def _nearest_first(grid: SurfaceGrid, number: Tensor, size: float) -> Iterator[tuple[int, Tensor]]:

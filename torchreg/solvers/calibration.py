@@ -31,18 +31,22 @@ class _Fit:
     ridge: float = 0.0015  # of squared weights, relative to the mean log-likelihood
     steps: int = 200  # of the optimizer, at most
     start: float = 0.5  # of all weights
+    moved: float = 2.0  # standard deviation of bias and weights about those of a model that is known before, log-odds
 
 
 _FIT = _Fit()
 
 
-def fit_logistic(evidence: Tensor, right: Tensor, weights: Tensor | None = None) -> Logistic:
-    """Return the logistic model of highest likelihood with weights of at least zero, and a ridge.
+def fit_logistic(
+    evidence: Tensor, right: Tensor, weights: Tensor | None = None, before: Logistic | None = None
+) -> Logistic:
+    """Return the logistic model of highest likelihood with weights of at least zero, and a ridge or a prior.
 
     Args:
         evidence: (N, E).
         right: (N,) bool.
         weights: (N,) of the cases; all alike by default.
+        before: the model fitted to other cases, the mean of the prior; few cases move it little.
 
     References: Platt 1999.
     """
@@ -56,7 +60,11 @@ def fit_logistic(evidence: Tensor, right: Tensor, weights: Tensor | None = None)
         optimizer.zero_grad()
         kept = torch.cat([free[:1], torch.nn.functional.softplus(free[1:])])
         losses = torch.nn.functional.binary_cross_entropy_with_logits(table @ kept, right.double(), reduction="none")
-        value = losses @ shares + _FIT.ridge * kept[1:].square().mean()
+        penalty = _FIT.ridge * kept[1:].square().mean()
+        if before is not None:
+            moved = (kept - kept.new_tensor([before.bias, *before.weights])) / _FIT.moved
+            penalty = 0.5 * moved.square().sum() / len(evidence)
+        value = losses @ shares + penalty
         value.backward()
         return value
 

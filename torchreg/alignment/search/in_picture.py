@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL
-from torchreg.alignment.evidence.reliability import CALIBRATION, shown_probability
+from torchreg.alignment.evidence.reliability import shown_probability
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.search.crops import LikelyCrop, crop_about, likely_crops
-from torchreg.alignment.search.pose_proposer import PoseProposer
+from torchreg.alignment.search.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.result import Status
 from torchreg.shapes.skin import LinearBlendSkin
@@ -26,7 +26,6 @@ class Choice:
 
     shown: float = PICTURE_MODEL.told  # probability that a crop shows the shape from which on no other crop is tried
     missed: float = 0.05  # the same of all crops that are left, below which none of them is tried: the level of a test
-    enough: float = CALIBRATION.doubtful  # confidence from which on other poses near are not sought
     not_found: float = 0.05  # below which the best pose is rejected, at the usual level of a test
 
 
@@ -43,23 +42,22 @@ class Aligner(Protocol):
 
 
 def align_in_picture(
-    frame: DepthFrame, skin: LinearBlendSkin, aligned: Aligner, config: AlignConfig, proposer: PoseProposer | None
+    frame: DepthFrame, skin: LinearBlendSkin, aligned: Aligner, config: AlignConfig, source: StartSource
 ) -> AlignResult:
     """Return the most probable alignment to crops of a frame, and its crop.
 
-    Crops are aligned from a network's pose, or without a search around the result; then the most probable one with a
-    search that knows rivals, unless it had one that leaves no doubt. NOT_FOUND where even its pose is hardly right.
+    Crops with a network's pose are aligned from it, unlikely ones without a search around the result; then the most
+    probable one with a search that knows rivals, if it may show the shape. NOT_FOUND where its pose is hardly right.
     """
     quick = replace(config, search="never")
 
     def answer(crop: LikelyCrop) -> AlignResult:
-        return aligned(crop.frame, config=quick, start=crop.start)
+        return aligned(crop.frame, config=quick if crop.is_quick else config, start=crop.start)
 
-    found, crop = surest_crop(frame, skin, answer, proposer)
-    if proposer is not None and crop.start is not None:
-        crop = replace(crop, frame=crop_about(frame, skin, proposer, found.pose) or crop.frame)
-    is_sure = _confidence(found) >= CHOICE.enough or config.search == "never" or found.coefficients is not None
-    if crop.start is not None or not is_sure:
+    found, crop = surest_crop(frame, skin, answer, source)
+    if crop.is_quick and (_odds(found, crop) >= 1 or _confidence(found) >= CHOICE.not_found):
+        if source.proposer is not None:
+            crop = replace(crop, frame=crop_about(frame, skin, source.proposer, found.pose) or crop.frame)
         found = aligned(crop.frame, config=config)
     return replace(_not_found_if_improbable(found), crop=crop.frame.mask)
 
@@ -68,16 +66,16 @@ def surest_crop(
     frame: DepthFrame,
     skin: LinearBlendSkin,
     answer: Callable[[LikelyCrop], Answer],
-    proposer: PoseProposer | None,
+    source: StartSource,
 ) -> tuple[Answer, LikelyCrop]:
     """Return the answer to the crop of a frame that most probably shows a shape, and that crop.
 
-    At most one crop shows the shape: others are tried while they may do so, by the odds of all of them.
+    Half of all pictures show the shape, in any of their crops: others are tried while they may do so.
     """
     best: tuple[Answer, LikelyCrop] | None = None
-    crops = likely_crops(frame, skin, proposer)
-    total = 1 + sum(crop.odds for crop in crops)
-    left = total - 1
+    crops = likely_crops(frame, skin, source)
+    left = sum(crop.odds for crop in crops)
+    total = len(crops) + left
     for crop in crops:
         found = answer(crop)
         if best is None or _worth(found, crop) > _worth(*best):
@@ -103,8 +101,11 @@ def _not_found_if_improbable(found: AlignResult) -> AlignResult:
 
 def _worth(found: Any, crop: LikelyCrop) -> float:
     """Return by what crops are compared: the odds of the better pose in a network's window, or the confidence."""
-    if crop.start is None or not isinstance(found, AlignResult):
-        return _confidence(found)
+    return _confidence(found) if crop.start is None or not isinstance(found, AlignResult) else _odds(found, crop)
+
+
+def _odds(found: Any, crop: LikelyCrop) -> float:
+    """Return the odds that a crop shows the shape, by its own pose or the one found, whichever is better."""
     shown = min(_shown(found), 1 - torch.finfo(torch.float32).eps)
     return max(crop.odds, shown / (1 - shown))
 

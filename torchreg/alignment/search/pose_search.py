@@ -13,6 +13,7 @@ from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.search.limb_search import Effort, LimbSearch
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, descend, take_rows
+from torchreg.alignment.search.rough_poses import register_rigidly
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface
@@ -75,6 +76,10 @@ class PoseSearch:
     def fitted_score(self, poses: Tensor) -> Tensor:
         """Return the scores (B,) of poses (B, num_dofs) after a fit without any search, comparable to `refine`'s."""
         return descend(self.problem, poses.unsqueeze(1), _REFINE.plan)[1][:, 0]
+
+    def registered(self, rough: Tensor, generator: torch.Generator) -> Candidates:
+        """Return rough poses (B, K, num_dofs) after a rigid registration, best first."""
+        return Candidates.ranked(self.problem, *register_rigidly(self.problem, rough, generator))
 
     def fit_coarsely(self, pool: Tensor) -> Tensor:
         """Return candidates (B, N, num_dofs) after surface fits of narrowing kernels, best and different ones first."""
