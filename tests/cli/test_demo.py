@@ -5,7 +5,8 @@ import json
 import torch
 
 import torchreg as tr
-from torchreg.datasets.hand import hand_motion
+from torchreg.datasets.sequences import hand_sequence
+from torchreg.tracking.demo import DEMO_FPS
 
 
 def test_the_demonstration_runs(run, tmp_path):
@@ -45,7 +46,7 @@ def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeyp
         return step(self, points, time, **told)
 
     # Where the hand is in the first frame is told, not searched for.
-    truth = hand_motion(tr.Hand(), "bending_palm", 2)[:1]
+    truth = hand_sequence("bending_palm", 2, DEMO_FPS, seed=0)[0].pose[None]
     starts = tr.PoseStarts(truth, torch.zeros(1), torch.ones(()))
     monkeypatch.setattr("torchreg.tracking.recovery.find_pose", lambda *arguments, **options: starts)
     monkeypatch.setattr(tr.Tracker, "step", interrupted)
