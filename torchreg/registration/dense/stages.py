@@ -18,8 +18,8 @@ from torchreg.registration.dense.problem import ScanAlignProblem
 
 # Stds beyond which the expectation no longer tells where a sample is: of a Gaussian three in a hundred lie there.
 _FAR_OFF = 3.0
-# Tokens of a limb, which are wrong together where they are: they count as one.
-_ALIKE = 30
+# Tokens that are wrong together, those of a limb or two: they count as one.
+_ALIKE = 64
 
 
 @dataclass(frozen=True)
