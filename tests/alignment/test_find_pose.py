@@ -225,6 +225,21 @@ def test_a_symmetric_object_is_doubtful_and_its_other_poses_stand_in_the_result(
     assert sorted(apart.argmin(1).tolist()) == [0, 1, 2]
 
 
+def test_both_ends_of_a_snake_may_be_its_head():
+    """Three capsules in a row that are alike, end to end: with the joints in the other order they lie as before."""
+    bends = [joint(f"bend{n}", n, (0.0, 0.0, 0.3), "revolute", (1.0, 0.0, 0.0), -1.5, 1.5) for n in range(2)]
+    snake = shape_of([joint("head", -1), *bends], [solid("capsule", (0.15, 0.03), 0, 0, 0.15)] * 3)
+    truth = torch.tensor([0.3, 0.0, 0.5, 1.0, 0.4, -0.8, 0.9, -0.3])
+    points = tr.sample_skin(snake, 400, seed=3)(truth)
+    aligned = tr.align(snake, points)
+    assert "another pose explains nearly as much" in aligned.doubt
+    poses = torch.cat([aligned.pose[None], aligned.rivals])
+    found = sorted(poses[:, 6:].tolist())
+    expected = [[-0.9, 0.3], [-0.3, 0.9], [0.3, -0.9], [0.9, -0.3]]  # either end, and rolled by half a turn
+    torch.testing.assert_close(torch.tensor(found), torch.tensor(expected), atol=0.02, rtol=0)
+    assert float(snake.distance(points.expand(4, -1, -1), poses).abs().mean()) < 0.001
+
+
 def test_noise_is_doubtful(find, starts):
     found = find(0.2 * torch.rand(400, 3, generator=generator(2)))
     assert 0 <= float(found.confidence) < float(starts.confidence.min())
