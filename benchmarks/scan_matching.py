@@ -43,7 +43,7 @@ from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.node_graph import spread_weights
 from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe
 from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities
-from torchreg.registration.dense.scan_tokens import ScanTokens
+from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
 # A match is right, and a place is visible, within these shares of the diagonal.
 RIGHT, VISIBLE = 0.05, 0.03
@@ -102,13 +102,11 @@ def measured(pair: Pair, matcher: ScanMatcher) -> Figures:
     begin = time.process_time()
     problem = describe(pair.source, pair.target, ScanAlignConfig())
     scans = (problem.source, problem.target)
-    logits = matcher(
-        *(ScanTokens.from_even(scan.points, scan.normals, scan.boundary, num_tokens=None) for scan in scans)
-    )
+    logits = matcher(*(ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in scans))
     (probability,), (hidden,), _ = (value.double() for value in match_probabilities(logits))
     size = pair.target.diagonal / problem.unit.scale
-    truth = problem.unit.normalize(pair.truth)[problem.samples[: probability.shape[0]]]
-    places = problem.target.points[: probability.shape[1]]
+    truth = problem.unit.normalize(pair.truth)[problem.samples[: SIZES.num_tokens]]
+    places = problem.target.points[: SIZES.num_tokens]
     visible = torch.cdist(truth, problem.target.points).amin(1) < VISIBLE * size
     right = (places[probability.argmax(1)] - truth).norm(dim=1) < RIGHT * size
     errors, registered = [], []

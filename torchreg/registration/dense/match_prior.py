@@ -47,8 +47,7 @@ class MatchPrior:
     @classmethod
     def of_samples(cls, source: OrientedSamples, target: OrientedSamples, count: int) -> MatchPrior:
         """Return what the matcher of torchreg says of samples, the first ``count`` of the source alone."""
-        scans = (source, target)
-        tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary, num_tokens=None) for scan in scans)
+        tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (source, target))
         logits = _matcher()(*tokens)[0].to(source.points)
         return cls.of_logits(logits, source.points[:count], target.points)
 

@@ -15,8 +15,8 @@ from torchreg.io.tensors import load_tensors
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
 WEIGHTS = Path(__file__).with_name("scan_matcher.safetensors")
-# Share of the tokens, those chosen first and so farthest from each other, whose relations to a token are its context.
-_ANCHORS = 3 / 16
+# Tokens, those chosen first and so farthest from each other, whose relations to a token are its context.
+_NUM_ANCHORS = 48
 # Distance at which relations of tokens change most, share of the scan's size.
 _NEAR = 0.1
 # Numbers that tell how two oriented points lie to each other, and with the ways between two tokens.
@@ -45,11 +45,10 @@ class ScanMatches:
 class ScanMatcher(nn.Module):
     """Tells which points of two partial scans of one moving thing are the same place on it.
 
-    Each scan is cut into 256 tokens, of whole surfaces up to 512. What is around a token and how tokens lie to each
-    other enters by distances and angles alone, so that turns and shifts of a scan change nothing; one of the angles has
-    a sign, which tells right from left. Tokens attend to those of their own scan, by their relations, and to those of
-    the other one, in turn; the similarity of two tokens is the logit of a match, and one more class means that a token
-    is hidden in the other scan.
+    Each scan is cut into 256 tokens. What is around a token and how tokens lie to each other enters by distances and
+    angles alone, so that turns and shifts of a scan change nothing; one of the angles has a sign, which tells right
+    from left. Tokens attend to those of their own scan, by their relations, and to those of the other one, in turn; the
+    similarity of two tokens is the logit of a match, and one more class means that a token is hidden in the other scan.
 
     Args:
         pretrained: whether to load the weights that come with torchreg.
@@ -102,14 +101,14 @@ class ScanMatcher(nn.Module):
         Raises:
             InputTypeError: if a scan is none, or dtypes or devices differ.
 
-        Cost: 0.15 CPU seconds, of whole surfaces .3.
+        Cost: 0.15 CPU seconds.
         """
         for name, scan in (("source", source), ("target", target)):
             if not isinstance(scan, RangeScan):
                 raise InputTypeError(f"{name} must be a RangeScan, got {type(scan).__name__}")
         check_same_kind(target.points, "target", source.points, "source")
         device = self.project.weight.device
-        tokens = [ScanTokens.from_scan(scan, num_tokens=None).to(device) for scan in (source, target)]
+        tokens = [ScanTokens.from_scan(scan).to(device) for scan in (source, target)]
         probability, hidden, target_hidden = match_probabilities(self(*tokens))
         like = source.points
         return ScanMatches(
@@ -143,7 +142,7 @@ class ScanMatcher(nn.Module):
         ]
         edge = scan.at_tokens(scan.boundary).to(points).unsqueeze(-1)
         relation = _relations(points, normals, scan.geodesic.to(points))
-        anchors = self.anchors(relation[:, :, : round(_ANCHORS * relation.shape[2])]).relu().mean(2)
+        anchors = self.anchors(relation[:, :, :_NUM_ANCHORS]).relu().mean(2)
         state = self.embed(torch.cat((*pooled, edge), dim=-1)) + self.context(anchors)
         return state, self.bias(self.relation(relation).relu()).movedim(-1, 1)
 

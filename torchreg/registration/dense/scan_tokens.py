@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.graphs import Graph
-from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sampling import even_order
 from torchreg.registration.normalization import Normalization
@@ -20,10 +19,8 @@ from torchreg.registration.normalization import Normalization
 class TokenSizes:
     """How a scan is cut into tokens, which weights are learnt for; lengths are shares of its size (`Normalization`)."""
 
-    num_tokens: int = 256  # in training, where they are about ``spacing`` apart
-    points_per_token: int = 6  # that are looked at, spread evenly over the scan
-    spacing: float = 0.025  # of neighboring tokens: a whole surface is cut into more of them than one side
-    most_tokens: int = 512  # of such a surface
+    num_points: int = 1536  # that are looked at, spread evenly over the scan
+    num_tokens: int = 256  # 4 % of a person apart
     num_neighbors: int = 32  # points drawn around a token, in each radius
     radii: tuple[float, float] = (0.05, 0.14)  # a wrist, a chest
     longest_edge: float = 0.12  # between tokens that are neighbors on the surface
@@ -61,22 +58,18 @@ class ScanTokens:
     scale: Tensor
 
     @classmethod
-    def from_scan(
-        cls, scan: RangeScan, generator: torch.Generator | None = None, num_tokens: int | None = SIZES.num_tokens
-    ) -> Self:
+    def from_scan(cls, scan: RangeScan, generator: torch.Generator | None = None) -> Self:
         """Return one scan's tokens, float32 on the CPU, B = 1.
 
         ``generator``: draws the points and neighbors; None draws points evenly spread, the same at every call.
-        ``num_tokens``: see `from_even`.
         """
-        count = SIZES.points_per_token * (num_tokens or SIZES.most_tokens)
         if generator is None:
-            index = scan.uniform_subsample(min(count, len(scan))).cpu()
+            index = scan.uniform_subsample(min(SIZES.num_points, len(scan))).cpu()
         else:
-            index = torch.randperm(len(scan), generator=generator)[:count]
+            index = torch.randperm(len(scan), generator=generator)[: SIZES.num_points]
         index = index[even_order(scan.points.detach().cpu()[index])]
         points, normals = (values.detach().cpu()[index] for values in (scan.points, scan.normals))
-        return cls.from_even(points, normals, scan.boundary.cpu()[index], index, generator, num_tokens)
+        return cls.from_even(points, normals, scan.boundary.cpu()[index], index, generator)
 
     @classmethod
     def from_even(
@@ -86,24 +79,20 @@ class ScanTokens:
         boundary: Tensor,
         index: Tensor | None = None,
         generator: torch.Generator | None = None,
-        num_tokens: int | None = SIZES.num_tokens,
     ) -> Self:
         """Return the tokens of samples of one scan: the first of them, B = 1.
 
         ``points``: (S, 3) samples, every first few of which cover the scan evenly, see `even_order`. ``index``: (S,)
-        points of the scan; the samples' own numbers by default. ``num_tokens``: None for as many as lie about as near
-        to each other as in training.
+        points of the scan; the samples' own numbers by default.
         """
-        num_tokens = num_tokens or _enough_tokens(points)
-        size = SIZES.points_per_token * num_tokens
-        count = min(size, len(points))
+        count = min(SIZES.num_points, len(points))
         index = torch.arange(count) if index is None else index[:count]
         draws = torch.Generator().manual_seed(0) if generator is None else generator
         unit = Normalization.from_points(points[:count])
         points = unit.normalize(points[:count])
-        tokens = torch.arange(num_tokens) % count
+        tokens = torch.arange(SIZES.num_tokens) % count
         distances = torch.cdist(points[tokens], points)
-        pad = size - count
+        pad = SIZES.num_points - count
         return cls(
             points=torch.nn.functional.pad(points.float(), (0, 0, 0, pad))[None],
             normals=torch.nn.functional.pad(normals[:count].float(), (0, 0, 0, pad))[None],
@@ -136,13 +125,6 @@ class ScanTokens:
     def token_index(self) -> Tensor:
         """(B, T) int64 points of the scan that are tokens."""
         return self.at_tokens(self.index)
-
-
-def _enough_tokens(points: Tensor) -> int:
-    """Return how many tokens of evenly ordered points (S, 3) keep `SIZES.spacing`, from those in training upwards."""
-    unit = Normalization.from_points(points)
-    apart = sampling_distance(unit.normalize(points[: SIZES.num_tokens])) / SIZES.spacing
-    return int(min(max(SIZES.num_tokens, SIZES.num_tokens * apart**2), SIZES.most_tokens))
 
 
 def _drawn_around(distances: Tensor, tokens: Tensor, radius: float, generator: torch.Generator) -> Tensor:
