@@ -16,10 +16,22 @@ from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_gr
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
 
-# Stds beyond which the expectation no longer tells where a sample is: of a Gaussian three in a hundred lie there.
-_FAR_OFF = 3.0
-# Tokens that are wrong together, those of a limb or two: they count as one.
-_ALIKE = 64
+
+@dataclass(frozen=True)
+class _Trust:
+    """How far expectations and tokens are to be trusted.
+
+    Args:
+        far_off: stds beyond which an expectation no longer tells where a sample is: of a Gaussian three in a hundred
+            samples lie there.
+        alike: tokens that are wrong together, those of a limb or two: they count as one.
+    """
+
+    far_off: float = 3.0
+    alike: int = 64
+
+
+_TRUST = _Trust()
 
 
 @dataclass(frozen=True)
@@ -70,9 +82,9 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
         matches = GraphMatches(
             slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
         )
-        tokens = match_tokens(problem, transforms, coarse, 1 / (1 + config.outliers))
+        tokens = match_tokens(problem, transforms, coarse, 1.0)
         # Each is chosen from both sides.
-        weight = (sigma / coarse) ** 2 / _ALIKE
+        weight = (sigma / coarse) ** 2 / _TRUST.alike
         tokens = replace(tokens, weights=0.5 * tokens.weights, tangential_weight=weight)
         fit = fit_graph(problem.graph, transforms, [matches, tokens], stiffness, edge_scale=config.edge_scale)
         transforms = fit.transforms
@@ -115,10 +127,10 @@ def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float
 
 
 def deviations(problem: ScanAlignProblem, places: Tensor) -> Tensor:
-    """Return squared distances of samples (S,) from where they are expected, in `_FAR_OFF`, at most one."""
+    """Return squared distances of samples (S,) from where they are expected, in `far_off`, at most one."""
     if problem.expected is None:
         return torch.zeros_like(places[:, 0])
-    apart = (places - problem.expected.places).norm(dim=-1) / (_FAR_OFF * problem.expected.std)
+    apart = (places - problem.expected.places).norm(dim=-1) / (_TRUST.far_off * problem.expected.std)
     return apart.clamp(max=1).square()
 
 
