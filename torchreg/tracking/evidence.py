@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchreg.alignment.evidence.clusters import CLUSTERS
+from torchreg.alignment.evidence.confidence import CLUSTERS
 from torchreg.alignment.evidence.picture_agreement import visible_points
 from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT

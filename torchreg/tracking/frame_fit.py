@@ -14,13 +14,11 @@ from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends, near_outlier_share
 from torchreg.alignment.evidence.curvature import hardly_gains
 from torchreg.alignment.evidence.reliability import Evidence, weigh
-from torchreg.alignment.fit.annealed_em import anneal
-from torchreg.alignment.fit.factors import Factor
+from torchreg.alignment.fit.annealed_em import SigmaSchedule, anneal
 from torchreg.alignment.fit.free_space_term import INTRUSION, FreeSpaceTerm
 from torchreg.alignment.fit.landmarks import keypoint_skin
-from torchreg.alignment.fit.objectives import GaussianPosePrior
+from torchreg.alignment.fit.objectives import Factor, GaussianPosePrior
 from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, free_space_loss
-from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
 from torchreg.alignment.fit.surface_fit import (
     SURFACE_FIT,
     SurfaceResult,

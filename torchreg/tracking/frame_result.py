@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg.alignment.evidence.observability import dof_confidence
+from torchreg.alignment.evidence.curvature import dof_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION, confidence_of
 from torchreg.alignment.fit.annealed_em import outlier_level
 from torchreg.result import Status

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem
-from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import surface_steps
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.shapes.limbs import Limb

@@ -8,10 +8,9 @@ from typing import Self, TypeVar
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit.factors import Factor
 from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
 from torchreg.alignment.fit.landmarks import MeasuredKeypoints, keypoint_skin
-from torchreg.alignment.fit.objectives import GaussianPosePrior, Objective
+from torchreg.alignment.fit.objectives import Factor, GaussianPosePrior, Objective
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
