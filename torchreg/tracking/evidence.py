@@ -61,8 +61,12 @@ PRESENCE = PresenceModel()
 
 def presence(fit: FrameFit) -> float:
     """Return the probability that the data show the shape where it was fitted, perhaps in another of its poses."""
-    noise = SURFACE_FIT.relative_noise(fit.residual, fit.view.problem.size)
-    return float(PRESENCE.probability(torch.stack([unseen_share(fit), noise])))
+    return float(PRESENCE.probability(presence_evidence(fit)))
+
+
+def presence_evidence(fit: FrameFit) -> Tensor:
+    """Return the evidence (2,) of a `PresenceModel`."""
+    return torch.stack([unseen_share(fit), SURFACE_FIT.relative_noise(fit.residual, fit.view.problem.size)])
 
 
 def unseen_share(fit: FrameFit) -> Tensor:

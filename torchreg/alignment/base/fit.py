@@ -13,8 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg.alignment.base.frames import BaseFrame, carrier
 from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
-from torchreg.alignment.fit.patches import independent_share
-from torchreg.alignment.fit.problem import masked_mean
+from torchreg.alignment.fit.problem import independent_share, masked_mean
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix

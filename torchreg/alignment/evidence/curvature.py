@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torchreg.alignment.evidence.confidence import SurfaceResiduals, end_motions, limb_points
 from torchreg.alignment.fit.objectives import GaussianPosePrior
-from torchreg.alignment.fit.patches import errors_per_patch
-from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem
+from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, errors_per_patch
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.shapes.articulation import Articulation

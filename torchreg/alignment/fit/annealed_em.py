@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
-from torchreg.alignment.fit.closest_point import closest_point
 from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
 from torchreg.alignment.fit.problem import AlignProblem
-from torchreg.alignment.fit.softassign import softassign
+from torchreg.alignment.fit.softassign import closest_point, softassign
 from torchreg.alignment.results import AlignRecord
 from torchreg.errors import InputError
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep, expectation, outlier_constant, working_volume
