@@ -11,7 +11,8 @@ is judged again by the models fitted before it:
 1. `LimbModel`: whether the end of a limb is off by at most a tenth of the shape's size, where most limbs are right;
 2. `PictureModel`: whether a pose lies about on the shape, at even odds before;
 3. `Calibration`: whether a pose is right, by the evidence that uses both; with weights for rooms and for elsewhere, and
-   a bias for each family of shapes.
+   a bias for each family of shapes;
+4. `PresenceModel` (alone: ``--only presence``): whether a tracker's search in a cloud of many things found the shape.
 
 The table is of models of poses fitted to the other cases, five times without a fifth of the seeds.
 """
@@ -19,6 +20,7 @@ The table is of models of poses fitted to the other cases, five times without a 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +34,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
-from confidence import Drawn, Subject, area_under_curve, subjects, turns
+from confidence import Drawn, Subject, area_under_curve, ends_of, observed, subjects, turns
 from scenes import cases
 
 import torchreg as tr
@@ -42,12 +44,17 @@ from torchreg.alignment.evidence import picture_agreement, reliability
 from torchreg.alignment.evidence.confidence import limb_data
 from torchreg.alignment.evidence.picture_agreement import LimbModel, PictureModel, picture_views
 from torchreg.alignment.evidence.reliability import Calibration
+from torchreg.alignment.find_pose import FindPoseConfig
+from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.solvers.calibration import fit_logistic
+from torchreg.tracking.evidence import PresenceModel, presence_evidence
+from torchreg.tracking.frame import Frame
 
 FOLDS, MISPLACED, ABOUT, BIAS_STD = 5, 0.1, 0.15, 1.0
 ROOM_FAMILIES = {"hand": "room with a hand", "held": "room with a hand", "arm": "room with a robot"}
 LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed to doubt it
+FAR, CUT_OFF = 0.4, 0.7  # of the size, between which poses tell nothing; of the data, at most
 FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
 
 
@@ -239,14 +246,66 @@ def drawn(data: Path | None, rooms: int, count: int) -> Iterator[Judged]:
         yield from alone(things[seed % len(things)], seed)
 
 
+def among_others(things: Sequence[Subject], seed: int) -> tuple[Subject, Tensor, Tensor | None]:
+    """Return a thing, a cloud (M, 3), and the ends (L, 3) of the thing's limbs; None where the cloud does not show it.
+
+    In the cloud are a tube, a wall and outliers beside the thing, of which a side may be cut off, or another one or
+    nothing in its place.
+    """
+    generator, thing = torch.Generator().manual_seed(seed), things[seed % len(things)]
+    there, whole, part = (torch.rand(3, generator=generator) - torch.tensor([0.5, 0.5, 0.0])).tolist()
+    shown = thing if there < 0 else things[seed % len(things) - 1]
+    _, data, pose, truth = observed(shown, generator)
+    points = (data.points if isinstance(data, tr.DepthFrame) else data).float()
+    middle = points.mean(0)
+    ends = ends_of(truth, thing.skin, pose) if there < 0 else None
+    if ends is None:
+        scaled = middle + (0.6 + 0.6 * part) * thing.size / shown.size * (points - middle)
+        points = scaled if whole < 0 and shown is not thing else points[:1]
+    elif whole < 0:
+        along = points @ torch.randn(3, generator=generator)
+        points = points[along >= along.quantile(CUT_OFF * part)]
+    angle = math.pi * torch.rand(150, generator=generator)
+    tube = torch.stack([0.15 * angle.cos(), 0.15 * angle.sin(), 0.8 * torch.rand(150, generator=generator)], dim=-1)
+    wall = torch.tensor([2.0, 2.0, 0.01]) * (torch.rand(300, 3, generator=generator) - 0.5)
+    turned = so3_exp(math.pi * torch.randn(2, 3, generator=generator)).mT
+    sides = 0.6 * torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=-1)
+    placed = zip((tube, wall), turned, sides, strict=True)
+    others = [middle + thing.size * (side + each @ turn) for each, turn, side in placed]
+    return thing, torch.cat([points, *others]).to(thing.shape.rest), ends
+
+
+def fitted_presence(things: Sequence[Subject], count: int) -> PresenceModel:
+    """Return the model of whether a search shows its shape; poses neither near nor far from it tell nothing."""
+    evidence, right = [], []
+    for seed in tqdm(range(FIRST_SEED, FIRST_SEED + count), desc="searches", leave=False, disable=None):
+        thing, cloud, ends = among_others(things, seed)
+        tracker = tr.Tracker(thing.shape, model_points=thing.skin)
+        frame = Frame(cloud=cloud, finite=torch.ones(len(cloud), dtype=torch.bool), elapsed=1.0)
+        with torch.no_grad():
+            fit = tracker._recover._find(tracker.state, frame, FindPoseConfig())
+            error = math.inf
+            if fit is not None and ends is not None:
+                found = ends_of(thing.shape, thing.skin, fit.world_pose)
+                error = float((found - ends).norm(dim=-1).mean()) / thing.size
+            if fit is not None and not ABOUT < error <= FAR:
+                evidence.append(presence_evidence(fit))
+                right.append(error <= ABOUT)
+    return PresenceModel(**vars(fit_logistic(torch.stack(evidence), torch.tensor(right))))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
     parser.add_argument("--rooms", type=int, default=80, help="pictures of each kind of room")
     parser.add_argument("--count", type=int, default=200, help="clouds and cut pictures")
     parser.add_argument("--smoke", action="store_true", help="a few of each")
+    parser.add_argument("--only", choices=["presence"], help="one of the models")
     given = parser.parse_args(arguments)
     rooms, count = (1, 6) if given.smoke else (given.rooms, given.count)
+    if given.only == "presence":
+        print(fitted_presence([thing for thing in subjects(given.data) if thing.name != "fox"], count))
+        return 0
     found = list(drawn(None if given.smoke else given.data, rooms, count))
     pictured = looked_at(found)
     limbs, pictures = fitted_limbs(pictured), fitted_pictures(pictured)

@@ -36,7 +36,12 @@ def body_like_anny():
             carrier = above if above in _TRUNK else above + side
             mirrored = [(sign * place[0], *place[1:]) for place in (center, joint)]
             parts[name + side] = (carrier, mirrored[0], half, mirrored[1])
-    ball, names = unit_sphere(1, dtype=torch.float64), list(parts)
+    return ellipsoid_body(parts, 1)
+
+
+def ellipsoid_body(parts, detail):
+    """A body of ellipsoids, as those above; its coefficients are stature and length of limbs."""
+    ball, names = unit_sphere(detail, dtype=torch.float64), list(parts)
     rows = [[torch.tensor(value, dtype=torch.float64) for value in row[1:]] for row in parts.values()]
     mesh = concatenate([tr.TriangleMesh(ball.vertices * half + center, ball.faces) for center, half, _ in rows])
     joints = torch.stack([joint for _, _, joint in rows])

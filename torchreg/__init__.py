@@ -22,7 +22,7 @@ _NAMES = {
     "alignment.pose_initializer": "InitialPose PoseInitializer PoseInitializerConfig",
     "alignment.search.pose_proposer": "PoseProposer ProposerSize",
     "alignment.results": "AlignResult BaseCalibration Calibration PoseStarts",
-    "alignment.fit.sigma_schedule": "SigmaSchedule",
+    "alignment.fit.annealed_em": "SigmaSchedule",
     "alignment.skeleton_source": "SpineLimbs",
     "alignment.train_initializer": "TrainingRow TrainInitializerConfig train_initializer",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",

@@ -8,8 +8,8 @@ from torchreg.alignment.calibrate_base import calibrate_base as calibrate_base
 from torchreg.alignment.config import AlignConfig as AlignConfig
 from torchreg.alignment.find_pose import FindPoseConfig as FindPoseConfig
 from torchreg.alignment.find_pose import find_pose as find_pose
+from torchreg.alignment.fit.annealed_em import SigmaSchedule as SigmaSchedule
 from torchreg.alignment.fit.em_loss import EMLoss as EMLoss
-from torchreg.alignment.fit.sigma_schedule import SigmaSchedule as SigmaSchedule
 from torchreg.alignment.pose_initializer import InitialPose as InitialPose
 from torchreg.alignment.pose_initializer import PoseInitializer as PoseInitializer
 from torchreg.alignment.pose_initializer import PoseInitializerConfig as PoseInitializerConfig

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 import torchreg as tr
+from tests.people import ellipsoid_body
 from torchreg.errors import InputError
-from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
+from torchreg.geometry.mesh import sample_surface
 
 QUICK = tr.AlignConfig(num_model_points=200, search="never")
 # By part: the one above, center and half axes of its ellipsoid, joint, metres.
@@ -36,21 +37,7 @@ COVERED = ("spine", "upperarm", "upperleg", "lowerleg")
 @pytest.fixture(scope="module")
 def body():
     """A body of ellipsoids, whose parts are named as anny's; its coefficients are stature and length of limbs."""
-    ball, names = unit_sphere(2, dtype=torch.float64), list(PARTS)
-    ellipsoids = [[torch.tensor(value, dtype=torch.float64) for value in row[1:]] for row in PARTS.values()]
-    mesh = concatenate([tr.TriangleMesh(ball.vertices * half + center, ball.faces) for center, half, _ in ellipsoids])
-    joints = torch.stack([joint for _, _, joint in ellipsoids])
-    weights = torch.eye(len(names), dtype=torch.float64).repeat_interleave(len(ball.vertices), 0)
-    parents = [names.index(row[0]) if row[0] else -1 for row in PARTS.values()]
-
-    def dirs(points):
-        limbs = points * torch.tensor([1.0, 0, 0]) * 0.2
-        return torch.stack([0.1 * points, limbs], dim=-1)
-
-    return tr.ArticulatedShape.from_skinned_mesh(
-        mesh.vertices, mesh.faces, weights, joints, parents, joint_names=names, shape_dirs=dirs(mesh.vertices),
-        joint_dirs=dirs(joints), coefficient_names=["stature", "limbs"], up=(0.0, 0.0, 1.0),
-    )  # fmt: skip
+    return ellipsoid_body(PARTS, 2)
 
 
 def scan(body, thickness, seed, count=1200):

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchreg.alignment.fit.closest_point import closest_point
-from torchreg.alignment.fit.softassign import softassign
+from torchreg.alignment.fit.softassign import closest_point, softassign
 from torchreg.solvers import e_step
 from torchreg.solvers.e_step import expectation
 

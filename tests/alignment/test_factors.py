@@ -7,7 +7,7 @@ from torch import Tensor
 
 import torchreg as tr
 from tests.alignment.made import problem_of
-from torchreg.alignment.fit.factors import Factor
+from torchreg.alignment.fit.objectives import Factor
 from torchreg.alignment.fit.surface_fit import fit_surface
 from torchreg.solvers.levenberg_marquardt import Linearization
 

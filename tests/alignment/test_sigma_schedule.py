@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import torchreg as tr
-from torchreg.alignment.fit.sigma_schedule import estimate_sigma
+from torchreg.alignment.fit.annealed_em import estimate_sigma
 from torchreg.solvers.e_step import expectation, posterior
 
 lengths = st.floats(1e-6, 1e3)

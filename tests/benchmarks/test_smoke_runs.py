@@ -17,6 +17,11 @@ RUNS = [
         "--smoke --threads 1",
         r"grid .*moments .*deform .*T-step, binary .*blended .*refine .*joints .*far .*drag ",
     ),
+    (
+        "calibrate_confidence",
+        "--smoke --only presence",
+        r"PresenceModel\(bias=\S+, weights=\(.+\), shown=",
+    ),
     ("depth_frames", "--smoke", r"cut: left out .*whole: left out.*clouds: 1 cases.*landmarks, both.*track, .*track, "),
     ("depth_pairs", "--smoke", r"made up: 1 pairs, overlap 0\.[5-9].*whole .*moved .*true masks +registered"),
     ("depth_pictures", "--smoke", r"reprojection.*farthest from its pixel, px \(<= 0.5\) +(0\.[0-4]|\d\S*e-).*normals"),

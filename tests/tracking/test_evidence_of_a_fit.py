@@ -134,7 +134,7 @@ def shown(arm, skin, cloud, pose):
 
 
 def test_presence_counts_the_surface_that_faces_the_data_and_has_none(arm, tracking):
-    """Half of a cloud hides what lies there, one side of it nothing; wherever it lies, and whatever it is turned to."""
+    """A cloud of one side misses nothing that a camera there sees; one without the tip misses it, in any base pose."""
     pose, skin, elbow = tracking.pose, tracking.skin, torch.linalg.inv(arm.part_transforms(tracking.pose)[1])
     mesh, toward = arm.surface_mesh(pose, spacing=0.01), torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     whole, sure = shown(arm, skin, mesh.vertices, pose)

@@ -14,13 +14,21 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
-from torchreg.alignment.base.covariance import base_covariance
-from torchreg.alignment.base.fit import BASE_FIT, BaseFit, BaseProblem, approach_base, base_of, fit_base, fit_offsets
+from torchreg.alignment.base.fit import (
+    BASE_FIT,
+    BaseFit,
+    BaseProblem,
+    approach_base,
+    base_covariance,
+    base_of,
+    fit_base,
+    fit_offsets,
+)
 from torchreg.alignment.base.frames import BaseFrame, read_frames
 from torchreg.alignment.base.search import PosedModel, rank_bases, search_base, seen_shares
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.fit.problem import fitted_surface, model_size
-from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.results import BaseCalibration
 from torchreg.capture.depth_frame import DepthFrame

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchreg._checks import check_choice, check_count, check_direction, check_positive
-from torchreg.alignment.fit.annealed_em import CORRESPONDENCES
-from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
+from torchreg.alignment.fit.annealed_em import CORRESPONDENCES, SigmaSchedule
 from torchreg.geometry.upright import Direction
 
 

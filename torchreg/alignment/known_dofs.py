@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.alignment.fit.objectives import GaussianPosePrior
-from torchreg.alignment.fit.patches import errors_per_patch
-from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem
+from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, errors_per_patch
 from torchreg.errors import InputError, InputTypeError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from torchreg._checks import check_choice, check_count, check_positive, check_shape
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.clusters import clustered_data
-from torchreg.alignment.evidence.confidence import EVIDENCE, pose_confidence
+from torchreg.alignment.evidence.confidence import EVIDENCE, clustered_data, pose_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
@@ -20,9 +19,9 @@ from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, centered_problem, masked_mean, soft_inliers
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.alignment.inputs import are_degenerate, check_clouds, check_skin
-from torchreg.alignment.search.fit_proposals import best_proposal
 from torchreg.alignment.search.pose_proposer import PoseProposer, shipped_proposer
 from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, typical_poses
+from torchreg.alignment.search.start_source import best_proposal
 from torchreg.errors import InputError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.shapes.articulated import ArticulatedShape

@@ -19,8 +19,8 @@ from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, alignment
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import UNITS, Task, check_clouds, warn_about_degenerate, warn_about_units
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.search.local_search import explore, needs_search
 from torchreg.alignment.search.multi_start import mean_distances
+from torchreg.alignment.search.pose_search import explore, needs_search
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.budget import BUDGET
 from torchreg.result import Status, normal_copy

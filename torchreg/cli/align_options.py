@@ -14,7 +14,7 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
+    from torchreg.alignment.fit.annealed_em import SigmaSchedule
     from torchreg.alignment.results import AlignResult
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.tracking.results import TrackResult
@@ -73,7 +73,7 @@ def read_schedule(text: str | None) -> SigmaSchedule | None:
     """Return the schedule that START:STOP:STEPS describes, None for None."""
     if text is None:
         return None
-    from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
+    from torchreg.alignment.fit.annealed_em import SigmaSchedule
 
     try:
         start, stop, steps = text.split(":")

@@ -201,7 +201,7 @@ def _read_angle(text: str | None) -> float:
 
 def observability(shape: ArticulatedShape, result: AlignResult) -> str:
     """Return in a sentence which joints the data do not hold; empty if they hold all."""
-    from torchreg.alignment.evidence.observability import spread_of
+    from torchreg.alignment.evidence.curvature import spread_of
 
     if result.covariance is None:
         return ""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchreg.alignment.evidence.clusters import CLUSTERS
+from torchreg.alignment.evidence.confidence import CLUSTERS
 from torchreg.alignment.evidence.picture_agreement import visible_points
 from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
@@ -61,8 +61,12 @@ PRESENCE = PresenceModel()
 
 def presence(fit: FrameFit) -> float:
     """Return the probability that the data show the shape where it was fitted, perhaps in another of its poses."""
-    noise = SURFACE_FIT.relative_noise(fit.residual, fit.view.problem.size)
-    return float(PRESENCE.probability(torch.stack([unseen_share(fit), noise])))
+    return float(PRESENCE.probability(presence_evidence(fit)))
+
+
+def presence_evidence(fit: FrameFit) -> Tensor:
+    """Return the evidence (2,) of a `PresenceModel`."""
+    return torch.stack([unseen_share(fit), SURFACE_FIT.relative_noise(fit.residual, fit.view.problem.size)])
 
 
 def unseen_share(fit: FrameFit) -> Tensor:

@@ -14,8 +14,8 @@ from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.problem import joint_precision, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.shape.clothing import CLOTH, clothed_rig, may_be_clothed
-from torchreg.alignment.shape.person_covariance import plausible_precision, robust_rows
 from torchreg.alignment.shape.shape_fit import fitted_rig, scan_normals, surface_skins
+from torchreg.alignment.shape.shape_problem import plausible_precision, robust_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.upright import Direction
 from torchreg.result import Status

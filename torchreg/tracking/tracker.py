@@ -32,8 +32,7 @@ from torchreg.tracking.config import TrackConfig
 from torchreg.tracking.evidence import is_continuous, is_doubtful, is_supported, is_unreliable, update_means
 from torchreg.tracking.frame import MIN_DATA, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
-from torchreg.tracking.frame_result import fitted_result, predicted_result, track_result
-from torchreg.tracking.model_points import next_model_points
+from torchreg.tracking.frame_result import fitted_result, next_model_points, predicted_result, track_result
 from torchreg.tracking.motion_model import advance_clock, decayed_velocity, initial_state, restart_motion, update_motion
 from torchreg.tracking.person_filter import KnownPerson, PersonFilter
 from torchreg.tracking.recovery import Recovery, after_search

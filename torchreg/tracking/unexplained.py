@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.evidence.clusters import CLUSTERS, OFF_SURFACE
+from torchreg.alignment.evidence.confidence import CLUSTERS, OFF_SURFACE
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.rigid import invert_rigid, transform_points

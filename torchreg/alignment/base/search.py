@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.base.frames import BaseFrame, carrier
-from torchreg.alignment.fit.sigma_schedule import narrowing
+from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, transform_points

@@ -11,17 +11,24 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from torchreg.alignment.evidence.clusters import OFF_SURFACE, clusters_beside
 from torchreg.alignment.evidence.confidence import (
     EVIDENCE,
+    OFF_SURFACE,
     SurfaceResiduals,
+    clusters_beside,
     end_spreads,
     end_variances,
     limb_points,
     near_outlier_share,
 )
-from torchreg.alignment.evidence.curvature import Curvature, curvature, plausible_precision
-from torchreg.alignment.evidence.observability import dof_confidence, far_variance, told_open
+from torchreg.alignment.evidence.curvature import (
+    Curvature,
+    curvature,
+    dof_confidence,
+    far_variance,
+    plausible_precision,
+    told_open,
+)
 from torchreg.alignment.evidence.other_explanations import open_rims, planes_instead
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureEvidence
 from torchreg.alignment.fit.problem import AlignProblem, free_space_loss

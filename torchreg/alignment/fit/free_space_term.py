@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from torchreg.alignment.fit.factors import Factor
+from torchreg.alignment.fit.objectives import Factor
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.neighbors import sampling_distance
 from torchreg.shapes.skin import LinearBlendSkin

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_positive
-from torchreg.alignment.fit.factors import Factor
+from torchreg.alignment.fit.objectives import Factor
 from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera, lens_jacobian
 from torchreg.geometry.rigid import invert_rigid, transform_points

@@ -8,10 +8,9 @@ from typing import Self, TypeVar
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit.factors import Factor
 from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
 from torchreg.alignment.fit.landmarks import MeasuredKeypoints, keypoint_skin
-from torchreg.alignment.fit.objectives import GaussianPosePrior, Objective
+from torchreg.alignment.fit.objectives import Factor, GaussianPosePrior, Objective
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
@@ -277,3 +276,18 @@ def free_space_loss(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the data (B,), softly counted, that model points in free space stand for; zero without a picture."""
     term = problem.factor(FreeSpaceTerm)
     return torch.zeros_like(pose[:, 0]) if term is None else term.score(pose, INLIER_SHARE * problem.size)
+
+
+# Edge of the patches within which data err together, as a share of the size: about a link of an arm.
+_PATCH = 0.15
+
+
+def independent_share(points: Tensor, size: float) -> float:
+    """Return the share of points (M, 3) on a thing of some size, metres, that are independent: one for each patch."""
+    return max(1, len((points / (_PATCH * size)).floor().unique(dim=0))) / max(1, len(points))
+
+
+def errors_per_patch(data: Tensor, valid: Tensor, size: float) -> Tensor:
+    """Return the mean number (B,) of data in a patch, which err as one, of a model of some size."""
+    shares = [independent_share(points[chosen], size) for points, chosen in zip(data, valid, strict=True)]
+    return torch.tensor([1 / share for share in shares]).to(data)

@@ -12,11 +12,10 @@ from torch import Tensor
 from torchreg._threads import one_thread
 from torchreg.alignment.evidence.picture_agreement import picture_views
 from torchreg.alignment.fit.problem import AlignProblem, centered_problem, model_size
-from torchreg.alignment.search.fit_proposals import best_proposal
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.alignment.search.pose_proposer import PoseProposer, Proposals
 from torchreg.alignment.search.pose_search import PoseSearch
-from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.search.start_source import StartSource, best_proposal
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import SurfaceGrid, candidate_crops
 from torchreg.capture.free_space import FreeSpace

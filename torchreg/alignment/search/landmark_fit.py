@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends
-from torchreg.alignment.evidence.curvature import plausible_precision
-from torchreg.alignment.evidence.observability import dof_confidence, told_open
+from torchreg.alignment.evidence.curvature import dof_confidence, plausible_precision, told_open
 from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.fit.landmarks import Landmarks, MeasuredKeypoints
 from torchreg.alignment.fit.objectives import Objective
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_problem
-from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates

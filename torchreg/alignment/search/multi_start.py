@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
+from torchreg.alignment.fit.annealed_em import ANNEALING, anneal, narrowing
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, alignment_cost
-from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface_steps
 from torchreg.solvers.robust import welsch_loss
 

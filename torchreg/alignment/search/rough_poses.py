@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchreg._checks import check_count, check_direction
+from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.fit.problem import AlignProblem
-from torchreg.alignment.fit.sigma_schedule import narrowing
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import rotation_between, so3_exp, so3_log, spread_rotations
 from torchreg.geometry.sampling import farthest_points

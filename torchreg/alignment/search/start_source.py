@@ -1,4 +1,4 @@
-"""Sources of start poses: rough poses for a search, and the proposals of a network."""
+"""Sources of start poses: rough poses for a search, and proposals of a network, fitted to the data in one batch."""
 
 from __future__ import annotations
 
@@ -7,15 +7,111 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.annealed_em import ANNEALING
+from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
+from torchreg.alignment.fit.problem import AlignProblem, joint_precision
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.search.fit_proposals import best_proposals, with_proposed_prior
-from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shared_proposer
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, take_rows
+from torchreg.alignment.search.pose_proposer import (
+    HoldsProposer,
+    PoseProposer,
+    Proposals,
+    check_proposer,
+    shared_proposer,
+)
+from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, PoseSource, UprightRotations
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.solvers.e_step import EStep
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Numbers of the fit; widths are shares of the model's size."""
+
+    kept: int = 2  # most probable proposals, beside that fitted to matches
+    surface_std: float = 0.015  # of where the network says that a datum lies on the shape
+    reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
+    joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
+    matched_steps: int = 2  # in each round
+
+
+_FIT = _Fit()
+# From what a proposal errs by to a searched pose's width.
+_PLAN = Plan(start=0.05, stop=0.02, steps=2)
+
+
+@dataclass(frozen=True, eq=False)
+class BestProposal:
+    """The pose (B, num_dofs) that explains most data, the mean of its prior, and its lead (B,) over the next."""
+
+    pose: Tensor
+    mean: Tensor
+    lead: Tensor
+
+
+@torch.no_grad()
+def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
+    """Return the pose that explains most data after a coarse fit, with the network's joints as the prior."""
+    told = with_proposed_prior(problem, proposals)
+    coarse = PoseSearch(told, torch.Generator().manual_seed(0)).coarse_problem
+    poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
+    pool = torch.cat([matched_pose(told, proposals).unsqueeze(1), poses], dim=1)
+    fitted = Candidates.descended(coarse, pool, _PLAN)
+    share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
+    best = fitted.poses[:, 0]
+    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead() * share)
+
+
+@torch.no_grad()
+def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
+    """Return ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first."""
+    coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
+    pool = torch.cat([problem.clamp_candidates(proposals.poses), matched_pose(problem, proposals).unsqueeze(1)], dim=1)
+    fitted = Candidates.descended(coarse, pool, _PLAN).distinct(SEARCH_BUDGET.same, count)
+    return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
+
+
+def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
+    """Return a problem whose prior's mean is the most probable proposal, except in joints with a prior."""
+    mean = problem.clamp_candidates(proposals.poses[:, :1])[:, 0]
+    precision = joint_precision(problem.skin.shape, problem.size, _FIT.joint_std)
+    if problem.prior_precision is None:
+        return replace(problem, prior=GaussianPosePrior(mean, precision))
+    told, prior = problem.prior_precision > 0, problem.prior
+    mean, precision = torch.where(told, prior.mean, mean), torch.where(told, prior.precision, precision)
+    return replace(problem, prior=replace(prior, mean=mean, precision=precision))
+
+
+def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
+    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest.
+
+    Pairs of a datum and a model point that rounding cannot tell from none are left out: few are near each other.
+    """
+    skin, sigma, pose = problem.skin, ANNEALING.stop * problem.size, problem.prior.mean
+    near = torch.cdist(proposals.surface, skin.points).square()
+    share = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1)
+    share, index = share.topk(int((share > torch.finfo(share.dtype).eps).sum(-1).max()), sorted=False)
+    told, index, points = share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2)
+    for width in (None, *_FIT.reach):
+        weight = told
+        if width is not None:
+            far = (points - take_rows(skin(pose), index).unflatten(1, told.shape[1:])).square().sum(-1)
+            weight = told * (far * (-0.5 / (width * problem.size) ** 2)).exp()
+        each = (weight.unsqueeze(-1) * pad(points, (0, 1), value=1.0)).flatten(1, 2)
+        sums = each.new_zeros(len(pose), len(skin), 4).scatter_add(1, index.unsqueeze(-1).expand_as(each), each)
+        total = sums[..., 3]
+        targets = sums[..., :3] / total.clamp_min(1e-9).unsqueeze(-1)
+        matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
+        objective = registration_objective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
+        for _ in range(_FIT.matched_steps):
+            pose = problem.step(objective(pose), pose).state
+    return pose
 
 
 @dataclass(frozen=True)

@@ -9,28 +9,24 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchreg.alignment.evidence.clusters import leaves_clusters
-from torchreg.alignment.evidence.confidence import EVIDENCE
-from torchreg.alignment.evidence.observability import dof_confidence
-from torchreg.alignment.fit.annealed_em import ANNEALING, StageResult, anneal
-from torchreg.alignment.fit.sigma_schedule import SigmaSchedule
+from torchreg.alignment.evidence.confidence import EVIDENCE, leaves_clusters
+from torchreg.alignment.evidence.curvature import dof_confidence
+from torchreg.alignment.fit.annealed_em import ANNEALING, SigmaSchedule, StageResult, anneal
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.pose_rows import PoseRows
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.shape.clothing import CLOTH, clothed_rig
-from torchreg.alignment.shape.clothing_evidence import are_clothes_likelier
-from torchreg.alignment.shape.person_covariance import noise_covariance, shared_covariance
-from torchreg.alignment.shape.person_gradient import person_with_gradients
+from torchreg.alignment.shape.clothing import CLOTH, are_clothes_likelier, clothed_rig
 from torchreg.alignment.shape.person_proposer import shipped_people
 from torchreg.alignment.shape.person_search import lead_over_rivals, limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_fit import (
     SHAPE_FIT,
     FittedShape,
     fitted_shape,
+    person_with_gradients,
     shape_problem,
 )
-from torchreg.alignment.shape.shape_problem import ShapeProblem
+from torchreg.alignment.shape.shape_problem import ShapeProblem, noise_covariance, shared_covariance
 from torchreg.errors import InputError
 from torchreg.result import normal_copy
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.evidence.clusters import CLUSTERS
+from torchreg.alignment.evidence.confidence import CLUSTERS
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.search.limb_search import joint_samples
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates
