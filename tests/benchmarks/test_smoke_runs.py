@@ -20,7 +20,7 @@ RUNS = [
     (
         "calibrate_confidence",
         "--smoke --only presence",
-        r"PresenceModel\(bias=\S+, weights=\(.+\), shown=",
+        r"PresenceModel\(bias=\S+, weights=\(.+\)\)",
     ),
     ("depth_frames", "--smoke", r"cut: left out .*whole: left out.*clouds: 1 cases.*landmarks, both.*track, .*track, "),
     ("depth_pairs", "--smoke", r"made up: 1 pairs, overlap 0\.[5-9].*whole .*moved .*true masks +registered"),

@@ -13,9 +13,8 @@ from torch.func import jacrev, vmap
 
 from tests.geometry.draws import D, rand, randn
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
-from torchreg.solvers.arrow import SharedRows
 from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
-from torchreg.solvers.levenberg_marquardt import Linearization, damped_step, levenberg_marquardt
+from torchreg.solvers.levenberg_marquardt import Linearization, SharedRows, damped_step, levenberg_marquardt
 
 RULE = DampingRule(trusted=0.5, down=0.1, doubtful=2.0, up=10.0, least=1e-9)
 

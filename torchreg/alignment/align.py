@@ -122,7 +122,9 @@ def align(
         raise InputError("initializer must be a PersonProposer with fit_shape, and a PoseProposer without")
     network = None if isinstance(initializer, PersonProposer) else initializer
     source = StartSource.of(shape, initializer=network, upright=config.upright)
-    known, clothed = KnownDofs.of(shape, locked, prior), may_be_clothed(shape, clothed, fit_shape)
+    known = KnownDofs.of(shape, locked, prior)
+    if fit_shape is not False or clothed != "auto":
+        clothed = may_be_clothed(shape, clothed, fit_shape)
     if fit_shape is not False:
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and keypoints is None)
     start = shape.pose_from_dict(initial_pose) if isinstance(initial_pose, Mapping) else initial_pose

@@ -14,7 +14,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
-from torchreg.alignment.fit.problem import AlignProblem, centered_problem, masked_mean
+from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, centered_problem, masked_mean
 from torchreg.alignment.inputs import (
     Task,
     check_clouds,
@@ -61,13 +61,13 @@ class FindPoseConfig:
     num_candidates: int = 64
     num_placed: int = 16
     num_searched: int = 4
-    search_rounds: int = 2
+    search_rounds: int = AlignConfig.search_rounds
     num_retries: int = 0
-    prior_std: float | None = 0.4
+    prior_std: float | None = BROAD_PRIOR.typical
     num_model_points: int = AlignConfig.num_model_points
     nan_policy: str = "raise"
     upright: Direction | None = None
-    seed: int = 0
+    seed: int = AlignConfig.seed
 
     def __post_init__(self) -> None:
         for name in ("num_candidates", "num_placed", "num_searched", "search_rounds", "num_model_points"):

@@ -17,7 +17,7 @@ from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
 from torchreg.alignment.fit.implicit_gradient import FixedPoint, attach_gradients
 from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, centered_problem, masked_mean, soft_inliers
-from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
+from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface_noise, surface_objective
 from torchreg.alignment.inputs import are_degenerate, check_clouds, check_skin
 from torchreg.alignment.search.pose_proposer import PoseProposer, shipped_proposer
 from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, typical_poses
@@ -69,8 +69,8 @@ class PoseInitializerConfig:
     """
 
     sigma_steps: int = 3
-    em_steps: int = 2
-    surface_steps: int = 2
+    em_steps: int = AlignConfig.em_steps
+    surface_steps: int = AlignConfig.surface_steps
     fit_steps: int = 6
     newton_steps: int = 2
     prior_std: float = 0.3
@@ -320,7 +320,7 @@ class PoseInitializer(nn.Module):
 
     def _last_fit(self, problem: AlignProblem, pose: Tensor, *, holds_base: bool) -> tuple[FixedPoint, Tensor]:
         """Return the energy of the last fit and its stationary pose (B, num_dofs)."""
-        noise = residual_noise(problem, pose)
+        noise = surface_noise(problem.surface.distance(problem.data, pose), problem.valid, problem.size)
         if self.config.noise is not None:
             noise = torch.full_like(noise, self.config.noise)
         sigma = SURFACE_FIT.width_per_noise * noise

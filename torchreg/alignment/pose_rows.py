@@ -250,9 +250,7 @@ def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, 
         return Status.DEGENERATE
     if num_inliers < max(UNITS.min_data, ROWS.min_share * num_data):
         return Status.FEW_INLIERS
-    if confidence < CALIBRATION.doubtful:
-        return Status.DOUBTFUL
-    return Status.CONVERGED if converged else Status.MAX_STEPS
+    return CALIBRATION.status(converged, confidence)
 
 
 def _unbatched(result: AlignResult) -> AlignResult:

@@ -48,7 +48,7 @@ class TrackConfig:
     debias: float = AlignConfig.debias
     nan_policy: str = "omit"
     upright: Direction | None = None
-    seed: int = 0
+    seed: int = AlignConfig.seed
 
     def __post_init__(self) -> None:
         check_choice(self.model_points, "model_points", ("seen", "data", "shape"))

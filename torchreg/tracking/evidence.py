@@ -49,11 +49,11 @@ class PresenceModel(Logistic):
     ``e`` are the `unseen_share` and the relative noise: background suits a part of the shape only, and another thing
     not exactly. How well the data determine the pose does not matter. Fitted to 165 searches for a hand or a robot arm
     among tubes, walls and points in the air: 77 show it, some with up to a third cut off, and 13 show the other one.
+    ``benchmarks/calibrate_confidence.py --only presence`` draws such searches anew, not these very ones.
     """
 
     bias: float = 5.59
     weights: tuple[float, ...] = (8.76, 4.52)
-    shown: float = 0.5  # probability from which on the shape is taken to be there
 
 
 PRESENCE = PresenceModel()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends, near_outlier_share
+from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends
 from torchreg.alignment.evidence.curvature import hardly_gains
 from torchreg.alignment.evidence.reliability import Evidence, weigh
 from torchreg.alignment.fit.annealed_em import SigmaSchedule, anneal, narrowing
@@ -296,8 +296,7 @@ class FrameFitter:
         problem, pose = fit.view.problem, fit.pose
         moves = end_motions(self.skin, pose, self._ends)
         evidence = weigh(
-            problem, fit.distance, beside=near_outlier_share(problem, fit.distance),
-            clustered=pose.new_tensor([len(fit.unexplained) / max(1, fit.num_inliers)]),
+            problem, fit.distance, clustered=pose.new_tensor([len(fit.unexplained) / max(1, fit.num_inliers)]),
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
             intruding=fit.intruding,
         )  # fmt: skip

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.curvature import dof_confidence
-from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION, confidence_of
+from torchreg.alignment.evidence.reliability import CALIBRATION, SHAPE_CALIBRATION
 from torchreg.alignment.fit.annealed_em import outlier_level
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.result import Status
@@ -37,7 +37,8 @@ def fitted_result(
         distance = problem.surface.distance(data, fit.pose)[0]
     posed = problem.skin.place(fit.rows)
     evidence, converged = fitter.judged(fit, covariance)
-    confidence = confidence_of(evidence.table(), CALIBRATION if fit.person is None else SHAPE_CALIBRATION)[0]
+    calibration = CALIBRATION if fit.person is None else SHAPE_CALIBRATION
+    confidence = calibration.probability(evidence.table())[0]
     sigma = posed.new_tensor(WIDTHS.stop * problem.size)
     outlier = outlier_level(problem, posed[None], sigma[None])
     distances = _distances_out_of_reach(frame)
@@ -48,16 +49,9 @@ def fitted_result(
         fitter, state, frame, pose=fit.world_pose, registered=posed + origin,
         keypoints=fitter.shape.placed_keypoints(fit.transforms) + origin, distances=distances, posterior=posterior,
         sigma=sigma, cost=posed.new_tensor(fit.cost), covariance=covariance, acquired=fit.acquired,
-        status=fit_status(converged, float(confidence)), residual=float(fit.residual), confidence=confidence,
+        status=CALIBRATION.status(converged, float(confidence)), residual=float(fit.residual), confidence=confidence,
         evidence=evidence.table()[0], dof_confidence=dof_confidence(fitter.shape, covariance, fitter.size),
     )  # fmt: skip
-
-
-def fit_status(converged: bool, confidence: float) -> Status:
-    """Return the status of a fit by what is known of it."""
-    if confidence < CALIBRATION.doubtful:
-        return Status.DOUBTFUL
-    return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
 def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose: Tensor, status: Status) -> FrameResult:

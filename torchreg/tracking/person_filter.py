@@ -22,7 +22,7 @@ from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.shaped import ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
-from torchreg.solvers.arrow import shared_information
+from torchreg.solvers.levenberg_marquardt import shared_information
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
@@ -19,7 +20,7 @@ from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.pose_algebra import difference, shifted
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.tracking.evidence import PRESENCE, is_doubtful, is_supported, presence, residual_too_large
+from torchreg.tracking.evidence import is_doubtful, is_supported, presence, residual_too_large
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.frame_fit import FrameFitter
 from torchreg.tracking.motion_model import uncertainty_growth
@@ -96,7 +97,7 @@ class Recovery:
             )
             fits = [fit for fit in (best, self._find(state, frame, config)) if fit is not None]
             best = max(fits, key=lambda fit: fit.soft_inliers, default=None)
-        return best if best is not None and presence(best) >= PRESENCE.shown else None
+        return best if best is not None and presence(best) >= CALIBRATION.doubtful else None
 
     def _find(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> FrameFit | None:
         """Return the fit of a search; of equivalent poses after a loss, that of the one nearest to the last."""

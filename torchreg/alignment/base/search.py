@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.alignment.base.fit import BASE_FIT
 from torchreg.alignment.base.frames import BaseFrame, carrier
 from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
@@ -29,7 +30,7 @@ class _BaseSearch:
     steps: int = 2  # with each kernel
     num_data: int = 450  # of all frames together
     num_kept: int = 3  # candidates returned, at most
-    score_width: float = 0.03  # of the last kernel, by which candidates are ranked
+    score_width: float = BASE_FIT.stop  # of the last kernel, by which candidates are ranked
     gap: float = 4.0  # typical angles between data, beyond which a model point is beside all that was seen
     same_turn: float = 0.2  # candidates whose bases differ by less are one, radians
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.alignment.fit.free_space_term import INTRUSION
 from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, soft_inliers
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, pose_covariance, surface_noise
 from torchreg.geometry.budget import BUDGET
@@ -21,7 +22,7 @@ class OffSurface:
     """Distance from which the surface does not explain data."""
 
     noises: float = 3.0  # standard deviations of the noise
-    share: float = 0.012  # of the model's size, at least: solids and skins are not exact
+    share: float = INTRUSION.tolerance  # of the model's size, at least: solids and skins are not exact
 
     def distance(self, noise: Tensor, size: float) -> Tensor:
         """Return the distance (...), metres, for noise (...) and a model's size in metres."""

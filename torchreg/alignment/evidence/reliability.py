@@ -36,6 +36,7 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
 from torchreg.geometry.rotation import so3_exp, so3_log
+from torchreg.result import Status
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.shaped import ShapedSkin
@@ -85,7 +86,6 @@ class _Scales:
     rival_share: float = 0.02  # of the data by which a pose leads: at which a rival counts 1 / e
     surface_error: float = 0.008  # standard error of a surface, share of the size: where half of the fits are wrong
     loose_error: float = 0.03  # the same of a part that is told to be hardly seen
-    loose_limb: float = 0.5  # probability from which on a limb is told to be so
 
 
 _SCALES = _Scales()
@@ -106,6 +106,12 @@ class Calibration(Logistic):
     weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93, 20.44, 3.78, 0.0, 0.0)
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
+
+    def status(self, converged: bool, confidence: float) -> Status:
+        """Return the status of a fit by what is known of it."""
+        if confidence < self.doubtful:
+            return Status.DOUBTFUL
+        return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
 CALIBRATION = Calibration()
@@ -204,7 +210,8 @@ def judge(
     there.
     """
     residuals = SurfaceResiduals.of(problem, pose)
-    spreads, picture = end_spreads(problem, pose, residuals), PictureEvidence.of(problem, pose, frames)
+    spreads = end_spreads(problem, pose, residuals)
+    picture = PictureEvidence.of(problem, pose, frames) if frames else None
     evidence = gather_evidence(problem, pose, residuals.distance, lead, spreads)
     loose = spreads > EVIDENCE.tolerance * problem.size
     if picture is not None:
@@ -213,7 +220,7 @@ def judge(
         if in_picture:
             evidence = replace(evidence, elsewhere=picture.elsewhere.square(), misplaced=picture.misplaced.mean(-1))
         residuals = replace(residuals, contradicted=picture.contradicted)
-        loose = loose | (picture.misplaced > _SCALES.loose_limb)
+        loose = loose | (picture.misplaced > CALIBRATION.doubtful)
     around, calibration = curvature(problem, pose, residuals), PICTURE_CALIBRATION if in_picture else CALIBRATION
     converged, shape = around.converged, problem.skin.shape
     if error is not None:
@@ -227,7 +234,7 @@ def judge(
         dof_confidence=dof_confidence(shape, covariance, problem.size),
         converged=converged,
         evidence=evidence,
-        confidence=confidence_of(evidence.table(), calibration),
+        confidence=calibration.probability(evidence.table()),
         doubt=tuple(
             "; ".join(filter(None, row))
             for row in zip(doubt_messages(problem, evidence, loose, _turns(pose, rivals)), left_open, strict=True)
@@ -246,20 +253,10 @@ def _with_far_poses(problem: AlignProblem, pose: Tensor, residuals: SurfaceResid
 def gather_evidence(
     problem: AlignProblem, pose: Tensor, distance: Tensor, lead: Tensor | None, spreads: Tensor
 ) -> Evidence:
-    """Return the evidence for poses (B, num_dofs), with distances (B, M) of the data and `end_spreads` (B, L).
-
-    ``lead`` (B,) is the cost by which the second-best pose of a search was worse; None for given starts.
-    """
+    """Return the evidence for poses (B, num_dofs), with distances (B, M) of the data and `end_spreads` (B, L)."""
     clustered, on_surface = clusters_beside(problem, distance)
-    return weigh(
-        problem,
-        distance,
-        beside=near_outlier_share(problem, distance),
-        clustered=clustered.to(pose) / on_surface.clamp_min(1),
-        spread=spreads.mean(-1),
-        intruding=free_space_loss(problem, pose),
-        lead=lead,
-    )
+    share, intruding = clustered.to(pose) / on_surface.clamp_min(1), free_space_loss(problem, pose)
+    return weigh(problem, distance, clustered=share, spread=spreads.mean(-1), intruding=intruding, lead=lead)
 
 
 def rival_margin(count: Tensor) -> Tensor:
@@ -268,39 +265,29 @@ def rival_margin(count: Tensor) -> Tensor:
 
 
 def weigh(
-    problem: AlignProblem,
-    distance: Tensor,
-    *,
-    beside: Tensor,
-    clustered: Tensor,
-    spread: Tensor,
-    intruding: Tensor,
+    problem: AlignProblem, distance: Tensor, *, clustered: Tensor, spread: Tensor, intruding: Tensor,
     lead: Tensor | None = None,
-) -> Evidence:
-    """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,)."""
+) -> Evidence:  # fmt: skip
+    """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,).
+
+    ``lead`` (B,) is the cost by which the second-best pose of a search was worse; None for given starts.
+    """
     noise = surface_noise(distance, problem.valid, problem.size)
     count = problem.valid.sum(-1).clamp_min(1).to(distance)
     near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
     lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
+    unasked = dict.fromkeys(("open_rim", "planes", "elsewhere", "misplaced"), torch.zeros_like(noise))
     return Evidence(
         noise=SURFACE_FIT.relative_noise(noise, problem.size),
-        beside=beside.sqrt(),
+        beside=near_outlier_share(problem, distance).sqrt(),
         clusters=clustered.sqrt().clamp_max(1),
         off=1 - near / count,
         free_space=(intruding / count).sqrt().clamp_max(1),
         unknown=(-(EVIDENCE.tolerance * problem.size / spread).square()).exp(),
         rival=(-lead / EVIDENCE.lead).exp(),
         rival_share=(-lead / (_SCALES.rival_share * count)).exp(),
-        open_rim=torch.zeros_like(noise),
-        planes=torch.zeros_like(noise),
-        elsewhere=torch.zeros_like(noise),
-        misplaced=torch.zeros_like(noise),
+        **unasked,
     )
-
-
-def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> Tensor:
-    """Return the calibrated probabilities (B,) that poses with evidence (B, E) are right."""
-    return calibration.probability(evidence)
 
 
 def shown_probability(evidence: Tensor) -> Tensor:

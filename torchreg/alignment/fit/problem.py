@@ -19,8 +19,7 @@ from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.shaped import ShapedSkin
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
-from torchreg.solvers.arrow import SharedRows
-from torchreg.solvers.levenberg_marquardt import Linearization, LMResult
+from torchreg.solvers.levenberg_marquardt import Linearization, LMResult, SharedRows
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 OneFactor = TypeVar("OneFactor", bound=Factor)
@@ -37,6 +36,7 @@ class BroadPrior:
     """Standard deviations of a plausible pose of which nothing else is known."""
 
     turn: float = 1.0  # of hinges and of the base's rotation, radians: a third of a half turn
+    typical: float = 0.4  # of joints about a typical pose, as to the middle of their limits, radians
     shift: float = 0.5  # of sliding joints and of the base's position, as a share of the model's size
 
     def precision(self, shape: Articulation, size: float) -> Tensor:

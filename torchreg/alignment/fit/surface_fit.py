@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchreg.alignment.fit.annealed_em import OnStep, StageResult, report_step
 from torchreg.alignment.fit.objectives import GaussianPosePrior, Objective, distance_objective
-from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem
 from torchreg.solvers.levenberg_marquardt import LMResult
 
 # The median absolute deviation of a Gaussian times this is its standard deviation.
@@ -24,7 +24,7 @@ class SurfaceFit:
 
     widths: tuple[float, ...] = (0.045, 0.022)  # of the kernel, before the last one, which follows from the noise
     min_width: float = 0.003  # of the last kernel: the model itself is no more exact
-    max_width: float = 0.02  # of the last kernel: data beyond are outliers
+    max_width: float = INLIER_SHARE  # of the last kernel: data beyond are outliers
     width_per_noise: float = 2.5  # at which a Welsch kernel is almost as efficient as least squares on Gaussian noise
     last_steps: int = 3  # at the last width, as a multiple of those at the others
     search_steps: int = 4  # at each width after a search, to whose time they hardly add
@@ -150,11 +150,6 @@ def surface_objective(
         lever=SURFACE_FIT.lever * problem.size,
         factors=problem.factors,
     )
-
-
-def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the robust standard deviation (B,) of the data near the surface, within a range of the model's size."""
-    return surface_noise(problem.surface.distance(problem.data, pose), problem.valid, problem.size)
 
 
 def surface_noise(distance: Tensor, valid: Tensor, size: float, *, clamped: bool = True) -> Tensor:

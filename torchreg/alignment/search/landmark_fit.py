@@ -13,7 +13,7 @@ from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.fit.landmarks import Landmarks, MeasuredKeypoints
 from torchreg.alignment.fit.objectives import Objective
-from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, centered_problem
+from torchreg.alignment.fit.problem import BROAD_PRIOR, PRIOR_SHARE, AlignProblem, centered_problem
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates
@@ -37,7 +37,6 @@ class _Search:
     steps: int = 2  # at each width
     refined: int = 24  # best candidates, of which each is refined
     refine_steps: int = 15
-    joint_std: float = 0.4  # of a weak prior about a typical pose, radians
     least: int = 4  # keypoints that agree with a pose, at least: three hold a rigid body, and leave two ways
 
 
@@ -73,7 +72,7 @@ class KeypointRows:
         near = typical_poses(shape).mean(0) if start is None else start[0]
         problem = centered_problem(
             skin, origin.unsqueeze(1), torch.zeros_like(origin[:, :1], dtype=torch.bool), near[None], origin,
-            prior_std=_SEARCH.joint_std, pose_atol=1e-4, keypoints=measured,
+            prior_std=BROAD_PRIOR.typical, pose_atol=1e-4, keypoints=measured,
         )  # fmt: skip
         if known is not None:
             given = known.start(shape, None if start is None else near)

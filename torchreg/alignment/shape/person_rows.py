@@ -16,9 +16,10 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.pose_rows import PoseRows
 from torchreg.alignment.results import AlignRecord, AlignResult
+from torchreg.alignment.search.multi_start import Candidates
 from torchreg.alignment.shape.clothing import CLOTH, are_clothes_likelier, clothed_rig
 from torchreg.alignment.shape.person_proposer import shipped_people
-from torchreg.alignment.shape.person_search import lead_over_rivals, limb_restarts, rotation_restarts
+from torchreg.alignment.shape.person_search import limb_restarts, rotation_restarts
 from torchreg.alignment.shape.shape_fit import (
     SHAPE_FIT,
     FittedShape,
@@ -138,7 +139,7 @@ class PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
         state = self._restarted_limb() if self.problem.scans == 1 else self.state
         costs = self.coarse.cost_of_people(state)
-        lead = lead_over_rivals(self.coarse, state, costs) if self._searched else None
+        lead = Candidates.ranked(self.coarse, state[None], costs[None]).lead() if self._searched else None
         best = self.problem.people(costs.argmin().unsqueeze(0))
         return replace(self, problem=self.problem.rows(best), state=state[best], lead=lead)
 

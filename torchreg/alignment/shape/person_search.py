@@ -123,8 +123,3 @@ def rotation_restarts(problem: ShapeProblem, state: Tensor) -> Tensor:
     middle = problem.skin(state.unsqueeze(0)).mean(-2)
     turned[:, 3:BASE_DOFS] = compose_rotation_vectors(_SEARCH.turn * torch.cat([axes, -axes]), turned[:, 3:BASE_DOFS])
     return shifted(turned, middle - problem.skin(turned).mean(-2))
-
-
-def lead_over_rivals(problem: AlignProblem, states: Tensor, costs: Tensor) -> Tensor:
-    """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity."""
-    return Candidates.ranked(problem, states[None], costs[None]).lead()

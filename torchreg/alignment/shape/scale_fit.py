@@ -14,8 +14,7 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.scale_jacobian import SCALE_RANGE, scale_jacobian
-from torchreg.solvers.arrow import SharedRows
-from torchreg.solvers.levenberg_marquardt import Linearization, LMResult
+from torchreg.solvers.levenberg_marquardt import Linearization, LMResult, SharedRows
 from torchreg.solvers.robust import welsch_loss
 
 

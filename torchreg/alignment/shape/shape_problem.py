@@ -15,7 +15,7 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, pose_covariance, sur
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shaped import ShapedSkin
 from torchreg.shapes.shaped_surface import ShapedSurface
-from torchreg.solvers.arrow import SharedRows
+from torchreg.solvers.levenberg_marquardt import SharedRows
 from torchreg.solvers.robust import welsch_weight
 
 

@@ -12,7 +12,7 @@ from torchreg.geometry.rigid import adjoint, se3_exp
 from torchreg.geometry.rotation import skew
 from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.surfaces import Blocks, Noise, Surfaces
-from torchreg.solvers.arrow import shared_information
+from torchreg.solvers.levenberg_marquardt import shared_information
 
 
 @dataclass(frozen=True)
