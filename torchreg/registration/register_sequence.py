@@ -188,7 +188,7 @@ def register_sequence(
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
-    moved, confidence, sure = _aligned_frames(
+    moved, confidence, sure = aligned_frames(
         scans, tree, num_bones, grid_resolution, config, generator=generator, on_step=on_step
     )
     normalized = [normalization.normalize_scan(scan) for scan in scans]
@@ -212,15 +212,15 @@ def _check_reference(reference: int | Literal["auto"], count: int) -> None:
             raise InputError(f"reference must be below the number of scans {count}, got {reference}")
 
 
-def _aligned_frames(
+def aligned_frames(
     scans: tuple[RangeScan, ...],
     tree: FrameTree,
     num_bones: int,
     grid_resolution: int,
     config: RegisterConfig,
     *,
-    generator: torch.Generator | None,
-    on_step: OnRegisterStep | None,
+    generator: torch.Generator | None = None,
+    on_step: OnRegisterStep | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the reference's points aligned with every frame, (T, N, 3), their confidence (T, N), and that of frames.
 

@@ -14,9 +14,15 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.upright import Y_UP, Direction
+from torchreg.registration.bones.alternation import Samples
+from torchreg.registration.bones.correspondences import Correspondences
+from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.joint_moments import gaps_at, motion_differences
 from torchreg.registration.bones.joints import Joints, bone_tree
-from torchreg.registration.results import SequenceRegistration
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.bones.weights import refine_weights
+from torchreg.registration.rigging.config import RigConfig
+from torchreg.registration.rigging.parts import moving_parts
 from torchreg.shapes.articulated import ArticulatedShape
 
 
@@ -57,21 +63,30 @@ class BoneTree:
     parents: tuple[int, ...]
 
     @classmethod
-    def of_sequence(cls, found: SequenceRegistration, mesh: TriangleMesh, scan: RangeScan) -> BoneTree:
-        """Return the bones of the template, a mesh and its coarse scan, as one tree: connected parts that move as one.
+    def of_alignment(
+        cls, moved: Tensor, confidence: Tensor, mesh: TriangleMesh, scan: RangeScan, most: int, config: RigConfig
+    ) -> BoneTree:
+        """Return the bones of the template, a mesh and its coarse scan aligned to (T, N, 3), as one tree.
 
-        Limbs that move alike, as the two legs of a jump, have one label in a registration, and no joint in common.
+        Limbs that move alike, as the two legs of a jump, have a bone and a joint each: connected parts do.
         """
-        edges, blended = _linked(scan), found.model.vertex_weights(scan.points).double()
-        parts = _Parts.of_owners(blended.argmax(1), edges, scan)
-        part, label = parts.part, parts.bone
-        motions, sizes = found.transforms.double()[:, label], torch.bincount(part).double()
-        middles = scan.points.new_zeros(len(label), 3).index_add(0, part, scan.points) / sizes[:, None]
-        joints = _joints(scan.points, parts.weights(scan.points, blended), edges, part, motions)
-        tree = bone_tree(joints, middles, sizes)
+        edges, confidence = _linked(scan), confidence.double().clamp(min=Samples.LEAST_CONFIDENCE)
+        cost = config.register.label_cost * float(scan.diagonal)
+        owner, motions = moving_parts(scan.points, edges, moved, confidence, most=most, cost=cost)
+        grid = SparseGrid.from_points(scan.points, config.cells)
+        cells = owner[nearest_neighbor(grid.cell_centers(), scan.points)[0]]
+        labeled = GridLBS.from_labels(grid, cells, motions.shape[1], motions)
+        correspondences = Correspondences(moved, None, confidence)
+        model = GridLBS(grid, refine_weights(labeled, scan.points, correspondences, config.register.refine).weights)
+        parts = _Parts.of_owners(owner, edges, scan)
+        part, motions = parts.part, motions[:, parts.bone]
+        sizes = torch.bincount(part).double()
+        middles = scan.points.new_zeros(len(sizes), 3).index_add(0, part, scan.points) / sizes[:, None]
+        blended = parts.weights(scan.points, model.vertex_weights(scan.points).detach())
+        tree = bone_tree(_joints(scan.points, blended, edges, part, motions), middles, sizes)
         bones = cls(
             vertices=mesh.vertices,
-            weights=parts.weights(mesh.vertices, found.model.vertex_weights(mesh.vertices).double()),
+            weights=parts.weights(mesh.vertices, model.vertex_weights(mesh.vertices).detach()),
             motions=motions,
             joints=tree.origins,
             parents=tree.parents,

@@ -28,7 +28,7 @@ class RigConfig:
         InputError: if a number is out of range.
     """
 
-    num_bones: int = 24
+    num_bones: int = 32
     num_points: int = 3000
     cells: int = 50
     rounds: int = 16

@@ -14,7 +14,8 @@ from torchreg._threads import one_thread
 from torchreg.errors import FramesWarning
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.upright import Direction
-from torchreg.registration.register_sequence import register_sequence
+from torchreg.registration.frame_tree import FrameTree
+from torchreg.registration.register_sequence import aligned_frames
 from torchreg.registration.rigging.bones import BoneTree
 from torchreg.registration.rigging.config import RigConfig
 from torchreg.registration.rigging.distances import SurfaceSamples, two_way_distance
@@ -94,12 +95,13 @@ def _rigged(
     frames: RigFrames, rows: list[int], count: int, config: RigConfig, up: Direction | None, step: OnStep
 ) -> tuple[ArticulatedShape, Tensor, Tensor]:
     """Return the rig of some frames, poses (T, D) of all that are used, and their errors (T,)."""
-    found = register_sequence(
-        [frames.scans[row] for row in rows], count, config.cells, config.register,
-        on_step=lambda record: step(record.stage), reference=rows.index(frames.template),
+    scan, tree = frames.scans[frames.template], FrameTree.in_turn(rows.index(frames.template), len(rows))
+    moved, confidence, _ = aligned_frames(
+        tuple(frames.scans[row] for row in rows), tree, count, config.cells, config.register,
+        on_step=lambda record: step(record.stage),
     )  # fmt: skip
-    scan = frames.scans[frames.template]
-    bones = BoneTree.of_sequence(found, frames.mesh, scan).pruned(config.alike * float(scan.diagonal), count)
+    bones = BoneTree.of_alignment(moved, confidence, frames.mesh, scan, count, config)
+    bones = bones.pruned(config.alike * float(scan.diagonal), count)
     fitter = SurfaceFitter(bones.shape(frames.mesh.faces, up), scan, config)
     starts = dict(zip(rows, poses_of_motions(fitter.shape, bones.motions), strict=True))
     return fitter.shape, *_fitted_poses(fitter, starts, frames, step)
