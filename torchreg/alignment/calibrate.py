@@ -74,7 +74,10 @@ class FramePoses:
         return replace(self, poses=poses, statuses=tuple(statuses), confidence=confidence, known=known)
 
     def of_person(self, shape: ArticulatedShape, data: Tensor, valid: Tensor, config: AlignConfig) -> FramePoses:
-        """Return the poses of a rig in frames (T, M, 3); the first sure one gives its coefficients."""
+        """Return the poses of a rig in frames (T, M, 3); the first sure one gives its coefficients.
+
+        Later ones in which a pose is doubtful are fitted with coefficients of their own, by more evidence.
+        """
         surest, first = None, 0
         for number, (points, kept) in enumerate(zip(data, valid, strict=True)):
             found = align(shape, points[kept], fit_shape=True, config=config)
@@ -87,7 +90,22 @@ class FramePoses:
         person, known = shape.with_coefficients(surest.coefficients), torch.zeros_like(self.known)
         poses = self.poses.index_put((torch.tensor(first),), surest.pose)
         known[first] = True
-        return replace(self, poses=poses, known=known).aligned(person, data, valid, config, None)
+        frames = replace(self, poses=poses, known=known).aligned(person, data, valid, config, None)
+        for number in filter(lambda left: left > first, frames.left_out):
+            found = align(shape, data[number, valid[number]], fit_shape=True, config=config)
+            if found.statuses[0].usable:
+                frames = frames._with(number, found)
+        return frames
+
+    def _with(self, number: int, found: AlignResult) -> FramePoses:
+        """Return the poses with that of another alignment in one frame."""
+        index = torch.tensor([number], device=self.poses.device)
+        statuses = (*self.statuses[:number], found.statuses[0], *self.statuses[number + 1 :])
+        return replace(
+            self, poses=self.poses.index_copy(0, index, found.pose.reshape(1, -1)), statuses=statuses,
+            confidence=self.confidence.index_fill(0, index, _confidence(found)),
+            known=self.known.index_fill(0, index, True),
+        )  # fmt: skip
 
     @property
     def failed(self) -> set[Status]:

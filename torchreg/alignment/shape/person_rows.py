@@ -138,10 +138,15 @@ class PersonRows:
     def restarted(self) -> PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
         state = self._restarted_limb() if self.problem.scans == 1 else self.state
-        costs = self.coarse.cost_of_people(state)
-        lead = Candidates.ranked(self.coarse, state[None], costs[None]).lead() if self._searched else None
+        return replace(self, state=state).best()
+
+    def best(self) -> PersonRows:
+        """Return the row of the best person."""
+        costs = self.coarse.cost_of_people(self.state)
+        ranked = Candidates.ranked(self.coarse, self.state[None], costs[None])
+        lead = ranked.lead() if self._searched else None
         best = self.problem.people(costs.argmin().unsqueeze(0))
-        return replace(self, problem=self.problem.rows(best), state=state[best], lead=lead)
+        return replace(self, problem=self.problem.rows(best), state=self.state[best], lead=lead)
 
     def finished(self) -> FoundPerson:
         """Return the person fitted to more and more data, with the deviations of alike coefficients learned."""
@@ -217,7 +222,8 @@ class PersonRows:
         state = torch.cat([bare.fitted.state, worn], dim=-1)
         if not are_clothes_likelier(one.draw(SHAPE_FIT.fine_data, self.generator), state, self._fitted_closely):
             return bare
-        return rows.annealed().fitted().restarted().finished()
+        # Limbs were restarted before, and what clothes leave over is no sign of another.
+        return rows.annealed().fitted().best().finished()
 
     def _learned_spread(self, problem: ShapeProblem, state: Tensor, alike: Tensor) -> tuple[ShapeProblem, Tensor]:
         """Return the problem with the deviations of alike coefficients learned, and states (T, D + K) fitted.

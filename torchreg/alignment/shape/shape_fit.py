@@ -16,6 +16,7 @@ from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import joint_precision, masked_mean, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.alignment.shape.clothing import ClothedSpace
+from torchreg.alignment.shape.outside_term import OutsideTerm
 from torchreg.alignment.shape.person_proposer import PersonProposer
 from torchreg.alignment.shape.person_search import find_people
 from torchreg.alignment.shape.shape_problem import ShapeProblem, noise_covariance, with_errors_of_parts
@@ -183,12 +184,15 @@ def shape_problem(
     mean = torch.cat([start[:, : shape.num_dofs], space.mean.expand(len(start), -1)], dim=-1)
     precision = torch.cat([joint_precision(shape, size, config.prior_std), space.std.square().reciprocal() / scans])
     every = normals.repeat(count, 1, 1)
+    centered = torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0)
+    outside = OutsideTerm.of_scans(model, centered, valid, normals, size)
+    factors = (outside.rows(torch.arange(scans).repeat(count)),) if bool(outside.weight.any()) else ()
     problem = ShapeProblem(
         skin=model, surface=ShapedSurface(dense, every, SURFACE_FIT.max_width * size),
-        data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0).repeat(count, 1, 1),
-        valid=valid.repeat(count, 1), origin=origin.repeat(count, 1), size=size, lower=tree.lower, upper=tree.upper,
+        data=centered.repeat(count, 1, 1), valid=valid.repeat(count, 1), origin=origin.repeat(count, 1), size=size,
+        lower=tree.lower, upper=tree.upper,
         prior=GaussianPosePrior(mean, precision), pose_atol=config.pose_atol, debias=config.debias, normals=every,
-        scans=scans,
+        scans=scans, factors=factors,
     )  # fmt: skip
     return problem, start
 
