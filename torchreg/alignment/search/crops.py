@@ -15,6 +15,7 @@ from torchreg.alignment.fit.problem import AlignProblem, centered_problem, model
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.alignment.search.pose_proposer import PoseProposer, Proposals
 from torchreg.alignment.search.pose_search import PoseSearch
+from torchreg.alignment.search.segmenter import shipped_segmenter
 from torchreg.alignment.search.start_source import StartSource, best_proposal
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import SurfaceGrid, candidate_crops
@@ -214,16 +215,19 @@ class _Windowed:
     def belonging(self, row: int, problem: AlignProblem, poses: Tensor, proposals: Proposals) -> Tensor:
         """Return the points (V,) that belong to the shape in a window rather than to something else.
 
-        By the network, and by the distance from its fitted pose: normal for the shape, uniform for something else.
+        By a network for that; else by that of the poses, and by the distance from its fitted pose: normal for the
+        shape, uniform for something else.
         """
-        valid = self.valid[row]
-        points = self.points[row, valid]
+        valid, segmenter, shape = self.valid[row], shipped_segmenter(problem.skin.shape), problem.skin.shape
+        points, kept = self.points[row, valid], torch.zeros_like(self.everything[:, 0], dtype=torch.bool)
+        if segmenter is not None:
+            kept[self.index[row, valid]] = segmenter.log_odds(shape, points, problem.size) > 0
+            return kept
         nearest = torch.cdist(points, proposals.points[row]).argmin(-1)
         told = proposals.inlier[row, nearest].clamp(0.02, 0.98).logit()
         distance = problem.surface.distance(points[None], poses[row, None])[0] / problem.size
         on_shape = -0.5 * (distance / _WINDOWS.pose_error).square()
         level = math.log(2 / math.sqrt(2 * math.pi) / _WINDOWS.pose_error * _WINDOWS.radius)
-        kept = torch.zeros(len(self.everything), dtype=torch.bool, device=points.device)
         kept[self.index[row, valid]] = told + on_shape + level > 0
         return kept
 

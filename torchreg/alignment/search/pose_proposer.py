@@ -47,7 +47,7 @@ class ProposerSize:
         width: of descriptions.
         heads: of attention.
         encoder: blocks of attention among tokens.
-        decoder: blocks of attention of hypotheses to tokens.
+        decoder: blocks of attention of hypotheses to tokens, zero for tokens alone.
         hypotheses: poses that are proposed.
         waves: frequencies in which a place enters.
     """
@@ -64,7 +64,7 @@ class ProposerSize:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            check_count(value, name, 1)
+            check_count(value, name, int(name != "decoder"))
         if self.width % (2 * self.heads):
             raise InputError(f"width must be a multiple of twice the heads, got {self.width} and {self.heads}")
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit.factors import Factor
 from torchreg.alignment.fit.free_space_term import INTRUSION
+from torchreg.alignment.fit.objectives import Factor
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.normals import NORMALS
 from torchreg.shapes.shaped import ShapedSkin
