@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment.evidence.other_explanations import planes_instead
+from torchreg.alignment.evidence.picture_agreement import planes_instead
 from torchreg.capture.depth_segments import open_rim
 
 CAMERA = tr.Camera(64, 48, (80.0, 80.0, 31.5, 23.5))

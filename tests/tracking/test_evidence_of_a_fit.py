@@ -9,8 +9,7 @@ import torchreg as tr
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.limbs import find_limbs
-from torchreg.tracking import unexplained
-from torchreg.tracking.evidence import presence, unseen_share
+from torchreg.tracking.evidence import LimbReach, UnexplainedClusters, presence, unseen_share
 from torchreg.tracking.frame import Frame
 
 CELL = 0.01
@@ -89,7 +88,7 @@ def test_new_clusters_are_background_only_after_searches_for_the_limb(arm, track
 
 @pytest.fixture(scope="module")
 def reach(plain_hand, plain_hand_skin):
-    return unexplained.LimbReach(plain_hand_skin, find_limbs(plain_hand)[0], CELL)
+    return LimbReach(plain_hand_skin, find_limbs(plain_hand)[0], CELL)
 
 
 def test_limbs_reach_the_space_within_their_limits_but_not_behind_the_wrist(reach, plain_hand, plain_hand_skin):
@@ -108,7 +107,7 @@ def test_limbs_reach_the_space_within_their_limits_but_not_behind_the_wrist(reac
     assert not bool(reach(behind, palm).any())
     assert not bool(reach(pose[:3] + torch.tensor([[9.0, 0, 0], [0, -9.0, 0]]), palm).any())
     # Without limbs all space counts.
-    assert bool(unexplained.LimbReach(plain_hand_skin, [], CELL)(9 * behind, torch.eye(4)).all())
+    assert bool(LimbReach(plain_hand_skin, [], CELL)(9 * behind, torch.eye(4)).all())
 
 
 def test_unexplained_clusters_are_as_dense_as_the_surface(plain_hand_skin):
@@ -118,7 +117,7 @@ def test_unexplained_clusters_are_as_dense_as_the_surface(plain_hand_skin):
     patch = torch.tensor([0.2, 0.2, 0.4]) + 0.1 * patch
     sparse = torch.rand(20, 3, generator=generator) + torch.tensor([0, 0, 1.0])
     data = torch.cat([sheet, patch, sparse])
-    clusters = unexplained.UnexplainedClusters(plain_hand_skin, [], 3.0)
+    clusters = UnexplainedClusters(plain_hand_skin, [], 3.0)
     found = clusters.find(data, data[:, 2], torch.tensor(0.01))
     assert len(found) >= 28
     assert float(torch.cdist(found, patch).amin(-1).max()) < 1e-3

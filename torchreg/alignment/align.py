@@ -121,7 +121,9 @@ def align(
     if initializer is not None and (people is None) == (fit_shape is not False):
         raise InputError("initializer must be a PersonProposer with fit_shape, and a PoseProposer without")
     network = None if isinstance(initializer, PersonProposer) else initializer
-    source = StartSource.of(shape, initializer=network, upright=config.upright)
+    source = StartSource()
+    if initial_pose is None or network is not None:
+        source = StartSource.of(shape, initializer=network, upright=config.upright)
     known = KnownDofs.of(shape, locked, prior)
     if fit_shape is not False or clothed != "auto":
         clothed = may_be_clothed(shape, clothed, fit_shape)

@@ -40,19 +40,12 @@ WIDTHS = KernelWidths()
 
 @dataclass(frozen=True)
 class Frame:
-    """What is known of a frame before it is aligned.
+    """What is known of a frame before it is aligned."""
 
-    Args:
-        cloud: (M, 3), metres.
-        finite: (M,) True where a point is finite.
-        elapsed: time since the frame before, in intervals.
-        picture: whose points the cloud holds, if it is that of a depth camera.
-    """
-
-    cloud: Tensor
-    finite: Tensor
-    elapsed: float
-    picture: DepthFrame | None = None
+    cloud: Tensor  # (M, 3), metres
+    finite: Tensor  # (M,) True where a point is finite
+    elapsed: float  # time since the frame before, in intervals
+    picture: DepthFrame | None = None  # whose points the cloud holds, if it is that of a depth camera
     known: KnownDofs | None = None
     keypoints: MeasuredKeypoints | None = None
 
@@ -81,23 +74,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame around a pose: the alignment of the data in reach, in coordinates around the pose's base.
+    """A frame around a pose: the alignment of the data in reach, in coordinates around the pose's base."""
 
-    Args:
-        problem: one alignment; its prior's mean is the pose.
-        origin: (3,) of its coordinates.
-        rows: (4 P, 3) part transforms of the prior's mean, see `LinearBlendSkin.place`.
-        in_reach: (M,) True where a point of the cloud is in reach of the shape; the problem may hold a subset of these.
-        elapsed: see `Frame`.
-        viewpoint: (3,) of the camera, if one took the frame.
-    """
-
-    problem: AlignProblem
-    origin: Tensor
-    rows: Tensor
-    in_reach: Tensor
+    problem: AlignProblem  # one alignment; its prior's mean is the pose
+    origin: Tensor  # (3,) of its coordinates
+    rows: Tensor  # (4 P, 3) part transforms of the prior's mean, see `LinearBlendSkin.place`
+    in_reach: Tensor  # (M,) where a point of the cloud is in reach; the problem may hold a subset of these
     elapsed: float
-    viewpoint: Tensor | None
+    viewpoint: Tensor | None  # (3,) of the camera, if one took the frame
 
     def to_local(self, poses: Tensor) -> Tensor:
         """Return poses (S, num_dofs) of the world in these coordinates and within the limits, (1, S, num_dofs)."""
@@ -106,43 +90,24 @@ class FrameView:
 
 @dataclass(frozen=True)
 class FrameFit:
-    """A pose fitted to a frame, in the coordinates of its view, and the evidence for it.
-
-    Args:
-        view: of the frame.
-        pose: (1, num_dofs).
-        distance: (1, M) signed distances of the data to the surface.
-        jacobian: (1, M, num_dofs) of the distances.
-        transforms: (P, 4, 4) of the parts.
-        residual: () robust standard deviation of the distances near the surface, metres.
-        last_step: (1, num_dofs) of the fit, in tangent coordinates.
-        cost: soft count of outliers and the prior, by which fits to a frame are ranked.
-        intruding: data that points in free space stand for, see `free_space_loss`.
-        num_inliers: number of data near the surface.
-        unexplained: (K, 3) clusters of data off the surface, as dense as the data on it.
-        num_new_unexplained: number of them that a limb can reach and that are no cluster of the frame before.
-        limit_share: share of the joints at a limit.
-        deviation: distance of most model points from the prediction, metres.
-        acquired: what led to the pose, see `FrameResult`.
-        person: the fit of pose and coefficients, where these are fitted too.
-    """
+    """A pose fitted to a frame, in the coordinates of its view, and the evidence for it."""
 
     view: FrameView
-    pose: Tensor
-    distance: Tensor
-    jacobian: Tensor
-    transforms: Tensor
-    residual: Tensor
-    last_step: Tensor
-    cost: float
-    intruding: Tensor
-    num_inliers: int
-    unexplained: Tensor
-    num_new_unexplained: int
-    limit_share: float
-    deviation: float
-    acquired: str
-    person: PersonFit | None = None
+    pose: Tensor  # (1, num_dofs)
+    distance: Tensor  # (1, M) signed distances of the data to the surface
+    jacobian: Tensor  # (1, M, num_dofs) of the distances
+    transforms: Tensor  # (P, 4, 4) of the parts
+    residual: Tensor  # () robust standard deviation of the distances near the surface, metres
+    last_step: Tensor  # (1, num_dofs) of the fit, in tangent coordinates
+    cost: float  # soft count of outliers and the prior, by which fits to a frame are ranked
+    intruding: Tensor  # data that points in free space stand for, see `free_space_loss`
+    num_inliers: int  # number of data near the surface
+    unexplained: Tensor  # (K, 3) clusters of data off the surface, as dense as the data on it
+    num_new_unexplained: int  # of them, that a limb can reach and that are no cluster of the frame before
+    limit_share: float  # share of the joints at a limit
+    deviation: float  # of most model points from the prediction, metres
+    acquired: str  # what led to the pose, see `FrameResult`
+    person: PersonFit | None = None  # where coefficients are fitted too
 
     @property
     def ratio_in_reach(self) -> float:

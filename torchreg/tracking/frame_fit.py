@@ -44,12 +44,11 @@ from torchreg.shapes.skin import LinearBlendSkin, sample_skin, stacked_rows
 from torchreg.solvers.cover import best_covers
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 from torchreg.tracking.config import TrackConfig
-from torchreg.tracking.evidence import share_at_limits
+from torchreg.tracking.evidence import UnexplainedClusters, share_at_limits
 from torchreg.tracking.frame import MIN_DATA, WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.motion_model import FILTER, moves_fast, predict_pose, prediction_std, uncertainty_growth
 from torchreg.tracking.person_filter import KnownPerson, Motion, PersonFilter, PersonFit
 from torchreg.tracking.results import TrackState
-from torchreg.tracking.unexplained import UnexplainedClusters
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from torchreg.alignment.evidence.curvature import (
     plausible_precision,
     told_open,
 )
-from torchreg.alignment.evidence.other_explanations import open_rims, planes_instead
-from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureEvidence
+from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureEvidence, open_rims, planes_instead
 from torchreg.alignment.fit.problem import AlignProblem, free_space_loss
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame

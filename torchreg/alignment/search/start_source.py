@@ -118,7 +118,7 @@ def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
 class StartSource:
     """Sources of rough poses to search from, a network whose poses need a fit alone, and known degrees of freedom."""
 
-    sources: Sequence[PoseSource]
+    sources: Sequence[PoseSource] = DEFAULT_SOURCES
     proposer: PoseProposer | None = None
     known: KnownDofs | None = None
 
