@@ -5,8 +5,8 @@ gives frames at equal times, every frame meshed anew by another tessellation, wi
 also holds captured sequences as .npz of vertices and faces. Prints mean two-way distances of the posed surface, % of
 the template's diagonal, of all frames but the template and of the worst one; the same of the template held still, and
 of its parts registered rigidly one by one from frame to frame; bones beside those that move in the clip; moving joints
-with a found one within 5 % of the diagonal; CPU s a frame; last the sums over all rigs. --alone leaves out the parts,
-which cost as much as the rigs. Without --data nothing is measured.
+with a found one within 5 % of the diagonal, and with one of as many points spread evenly; CPU s a frame; last the sums
+over all rigs. --alone leaves out the parts, which cost as much as the rigs. Without --data nothing is measured.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from torchreg.geometry.mesh import even_samples
 from torchreg.geometry.neighbors import NeighborTree, nearest_neighbor
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
+from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.scan_clusters import clustered_scan
 from torchreg.registration.rigging.distances import surface_distances
 
@@ -166,8 +167,12 @@ def measure(name: str, meshes: Sequence[tr.TriangleMesh], joints: Tensor | None,
     if joints is not None:
         count = joints.shape[1]
         found = rig.joints[1:].double()
-        near = int((torch.cdist(joints[rig.template], found) / size < NEAR).any(1).sum()) if len(found) else 0
-        text += f" bones {len(rig.joints)} of {count + 1}, joints {near} of {count}"
+        even = still[farthest_points(still, max(1, len(found)))].double()[: len(found)]
+        near, chance = (
+            int((torch.cdist(joints[rig.template], each) / size < NEAR).any(1).sum()) if len(each) else 0
+            for each in (found, even)
+        )
+        text += f" bones {len(rig.joints)} of {count + 1}, joints {near} of {count} ({chance} by chance)"
     text += f"  {rig.status}  {seconds:.1f} CPU s"
     return Figures(text, float(rows[0].mean()), float(rows[0].max()), near, count, len(rig.joints))
 

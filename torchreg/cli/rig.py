@@ -35,7 +35,7 @@ def rig(
     template: Annotated[
         int | None, typer.Option(min=0, help="Number of the frame that is rigged, from 0; chosen by default.")
     ] = None,
-    bones: Annotated[int, typer.Option(help="Most bones.")] = 24,
+    bones: Annotated[int, typer.Option(help="Most bones.")] = 32,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "raise",
     up: Up = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -33,9 +34,9 @@ def moving_parts(
 
     Patches are merged to more parts than there are bones, as a rigid part cannot tell a bend from a bone. Then the part
     is left out, again and again, whose points the linear blends of two neighbors, each point with a share of its own,
-    explain best, until that adds more than ``cost`` squared to the mean squared residual with weights (T, N), and at
-    most ``most`` are left. A bone costs what its motions take to describe (Ward 1963; Le and Deng 2014, section 4, for
-    bones that others explain).
+    explain best, until that adds more to the mean squared residual with weights (T, N) than ``cost`` squared and what
+    the motions of a bone take to describe in patches of that residual, and at most ``most`` are left (Schwarz 1978;
+    Ward 1963; Le and Deng 2014, section 4, for bones that others explain).
     """
     weights = weights / weights.sum()
     length = (points[edges[:, 0]] - points[edges[:, 1]]).norm(dim=-1)
@@ -59,6 +60,8 @@ class _Bones:
     ) -> None:
         self._points, self._edges, self._moved, self._weights = points, edges, moved, weights
         self.part, self._motions = part.clone(), motions
+        independent = 1 + len(points) // _CANDIDATES.points
+        self._share = math.log(independent) / independent
         everywhere = torch.arange(len(points))
         self._residual = self._blended(everywhere, motions[:, part], motions[:, part])[0]
 
@@ -68,7 +71,8 @@ class _Bones:
         while len(found) > 1:
             bone = min(found, key=lambda each: found[each][0])
             price, own, part, residual = found[bone]
-            if price == float("inf") or (price > cost and len(found) <= most):
+            worth = cost + float(self._residual.sum()) * self._share
+            if price == float("inf") or (price > worth and len(found) <= most):
                 break
             around = self._neighbors(bone)
             self.part[own], self._residual[own] = part, residual

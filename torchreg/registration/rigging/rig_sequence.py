@@ -44,9 +44,10 @@ def rig_sequence(
 
     1. Frames of another unit, empty ones and those of another thing's size are left out, with a sentence each.
     2. The template is the frame of most surface: where limbs touch, surface is lost.
-    3. The template is registered to all frames, from neighbor to neighbor, and bones, weights and joints are found
-       that explain all of them, see `register_sequence`. The strongest joints make a tree.
-    4. The rig of balls at these joints is fitted to every frame's surface by matches both ways, from the registration
+    3. The template is aligned with all frames, from neighbor to neighbor, as in `register_sequence`. Parts that neither
+       move rigidly with a neighbor nor as a blend of two are bones, see `moving_parts`; weights explain how the surface
+       moves between them, and the strongest joints make a tree.
+    4. The rig of balls at these joints is fitted to every frame's surface by matches both ways, from the alignment
        and from the neighbor in time; the better is kept.
 
     Args:
@@ -70,10 +71,10 @@ def rig_sequence(
 
     Differentiable: no.
 
-    Cost: 2 to 5 s a frame on one core, whatever its size.
+    Cost: 2 to 4 s a frame on one core, whatever its size.
 
-    References: Le and Deng 2014, Robust and accurate skeletal rigging from mesh sequences, for the problem; Chang and
-    Zwicker 2009, section 6, for bones and weights of all frames at once.
+    References: Le and Deng 2014, Robust and accurate skeletal rigging from mesh sequences; Chang and Zwicker 2009,
+    section 3, for weights.
     """
     config = RigConfig() if config is None else config
     count = config.num_bones if num_bones is None else num_bones
