@@ -116,7 +116,8 @@ def crop_about(frame: DepthFrame, skin: LinearBlendSkin, proposer: PoseProposer,
         if not len(windows.centers):
             return None
         problem = windows.problem(skin, [frame.near(center[0].double())])
-        mask = grid.mask(windows.belonging(0, problem, shifted(pose[None], -center), windows.proposed(proposer)))
+        proposals, told = windows.proposed(proposer), windows.segmented(problem)
+        mask = grid.mask(windows.belonging(0, problem, shifted(pose[None], -center), proposals, told))
         return frame.cropped(mask) if int(mask.sum()) >= _WINDOWS.least else None
 
 
@@ -162,11 +163,12 @@ def _proposed_crops(grid: SurfaceGrid, skin: LinearBlendSkin, proposer: PoseProp
     views = _tables(problem, poses, frames)
     elsewhere = 1 - proposals.inlier.sum(-1) / windows.valid.sum(-1).clamp_max(proposals.inlier.shape[-1])
     odds = WINDOW_MODEL.log_odds(torch.cat([views, elsewhere.unsqueeze(-1)], dim=-1)).exp()
+    told = windows.segmented(problem)
     starts = shifted(poses, windows.centers)
     return [
         LikelyCrop(grid.frame.cropped(mask), float(odds[row]), starts[row])
         for row in odds.argsort(descending=True).tolist()
-        if int((mask := grid.mask(windows.belonging(row, problem, poses, proposals))).sum()) >= _WINDOWS.least
+        if int((mask := grid.mask(windows.belonging(row, problem, poses, proposals, told))).sum()) >= _WINDOWS.least
     ]
 
 
@@ -212,23 +214,33 @@ class _Windowed:
             prior_std=None, pose_atol=0.0, free_space=FreeSpace.stacked([each.free_space for each in frames]),
         )  # fmt: skip
 
-    def belonging(self, row: int, problem: AlignProblem, poses: Tensor, proposals: Proposals) -> Tensor:
+    def segmented(self, problem: AlignProblem) -> Tensor | None:
+        """Return the log-odds (B, M) that points belong to the shape by a network for that; None without one."""
+        segmenter = shipped_segmenter(problem.skin.shape)
+        if segmenter is None:
+            return None
+        return segmenter.log_odds(problem.skin.shape, self.points, self.valid, problem.size)
+
+    def belonging(
+        self, row: int, problem: AlignProblem, poses: Tensor, proposals: Proposals, told: Tensor | None
+    ) -> Tensor:
         """Return the points (V,) that belong to the shape in a window rather than to something else.
 
-        By a network for that; else by that of the poses, and by the distance from its fitted pose: normal for the
-        shape, uniform for something else.
+        By log-odds that are ``told`` (B, M), else by the network of the poses; and by the distance from its fitted
+        pose: normal for the shape, uniform for something else.
         """
-        valid, segmenter, shape = self.valid[row], shipped_segmenter(problem.skin.shape), problem.skin.shape
-        points, kept = self.points[row, valid], torch.zeros_like(self.everything[:, 0], dtype=torch.bool)
-        if segmenter is not None:
-            kept[self.index[row, valid]] = segmenter.log_odds(shape, points, problem.size) > 0
-            return kept
-        nearest = torch.cdist(points, proposals.points[row]).argmin(-1)
-        told = proposals.inlier[row, nearest].clamp(0.02, 0.98).logit()
+        valid = self.valid[row]
+        points = self.points[row, valid]
+        if told is None:
+            nearest = torch.cdist(points, proposals.points[row]).argmin(-1)
+            odds = proposals.inlier[row, nearest].clamp(0.02, 0.98).logit()
+        else:
+            odds = told[row, valid]
         distance = problem.surface.distance(points[None], poses[row, None])[0] / problem.size
         on_shape = -0.5 * (distance / _WINDOWS.pose_error).square()
         level = math.log(2 / math.sqrt(2 * math.pi) / _WINDOWS.pose_error * _WINDOWS.radius)
-        kept[self.index[row, valid]] = told + on_shape + level > 0
+        kept = torch.zeros(len(self.everything), dtype=torch.bool, device=points.device)
+        kept[self.index[row, valid]] = odds + on_shape + level > 0
         return kept
 
 

@@ -47,17 +47,19 @@ class Segmenter(CloudNet):
         return self.told(found.tokens).float().squeeze(-1), found.token_index
 
     @torch.no_grad()
-    def log_odds(self, shape: Articulation, points: Tensor, size: float) -> Tensor:
-        """Return the log-odds (M,) that points (M, 3), metres, belong to a shape of a size in metres."""
+    def log_odds(self, shape: Articulation, points: Tensor, mask: Tensor, size: float) -> Tensor:
+        """Return the log-odds (B, M) that points (B, M, 3), metres, with a mask (B, M) belong to a shape of a size."""
         # A left hand is a right one in a mirror.
         flip = points.new_tensor([-1.0 if getattr(shape, "side", "right") == "left" else 1.0, 1.0, 1.0])
-        cloud, mask = self.fitting((points * flip / size)[None], torch.ones_like(points[None, :, 0], dtype=torch.bool))
-        told, index = self(cloud.to(self.queries), mask)
-        known = mask[0, index[0]]
-        tokens, told = cloud[0, index[0][known]], told[0, known].to(points)
-        apart, near = torch.cdist(points * flip / size, tokens).topk(min(_INTERPOLATED, len(tokens)), largest=False)
+        places = points * flip / size
+        cloud, known = self.fitting(places, mask)
+        told, index = self(cloud.to(self.queries), known)
+        tokens = cloud.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
+        apart = torch.cdist(places, tokens).masked_fill(~known.gather(1, index).unsqueeze(1), torch.inf)
+        apart, near = apart.topk(min(_INTERPOLATED, index.shape[1]), largest=False)
         weight = apart.clamp_min(torch.finfo(apart.dtype).eps).square().reciprocal()
-        return (weight * told[near]).sum(-1) / weight.sum(-1)
+        told = told.to(points).unsqueeze(1).expand(-1, points.shape[1], -1).gather(2, near)
+        return (weight * told).sum(-1) / weight.sum(-1)
 
     def save(self, path: str | os.PathLike[str], training: Mapping[str, Any] | None = None) -> None:
         """Write the weights in half precision as safetensors, and beside them JSON with what to remember of training.
