@@ -62,6 +62,8 @@ class HeldThings(Clutter):
 def windows_of_room(seed: int, size: float, generator: torch.Generator, kind: str = "held") -> list[Window]:
     """Return windows of a room about a hand: points (M, 3) about their middle, metres, and which show the hand (M,)."""
     scene = KINDS[kind](seed, True)
+    if scene.shown is None or scene.keypoints is None:
+        raise ValueError(f"rooms of kind {kind!r} do not say what shows a hand")
     grid = SurfaceGrid.of(scene.frame, size).without_planes(size)
     points, found = grid.points.float(), []
     column, row = scene.frame.camera.project(grid.points.double())[0].round().long().unbind(-1)
@@ -98,10 +100,12 @@ def batch_of_rooms(windows: list[Window], net: Segmenter, size: float, generator
     return points, labels
 
 
-def made_up_batch(skin: tr.LinearBlendSkin, net: Segmenter, size: float, generator: torch.Generator) -> Window:
+def made_up_batch(
+    hand: tr.Hand, skin: tr.LinearBlendSkin, net: Segmenter, size: float, generator: torch.Generator
+) -> Window:
     """Return the same of made-up clouds."""
     with patch.multiple(cloud_batches, _VARIETY=VARIETY, Clutter=HeldThings), torch.no_grad():
-        poses = random_poses(skin.shape, BATCH, generator)
+        poses = random_poses(hand, BATCH, generator)
         batch = random_clouds(skin, size, poses, net.size.points, generator, in_scenes=True)
     return batch.points / size, torch.where(batch.mask, (batch.index >= 0).float(), torch.nan)
 
@@ -135,7 +139,7 @@ def train(output: Path, rooms: int, minutes: float, seed: int) -> Segmenter:
             group["lr"] = RATE * min(1.0, (step + 1) / WARM_UP) * (0.5 + 0.5 * math.cos(math.pi * share))
         optimizer.zero_grad()
         arguments = net, size, generator
-        drawn = made_up_batch(skin, *arguments) if step % 2 else batch_of_rooms(windows, *arguments)
+        drawn = made_up_batch(hand, skin, *arguments) if step % 2 else batch_of_rooms(windows, *arguments)
         loss = loss_of(net, *drawn)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)

@@ -62,14 +62,16 @@ class Segmenter(CloudNet):
         return (weight * told).sum(-1) / weight.sum(-1)
 
     def save(self, path: str | os.PathLike[str], training: Mapping[str, Any] | None = None) -> None:
-        """Write the weights in half precision as safetensors, and beside them JSON with what to remember of training.
+        """Write the weights as safetensors, and beside them JSON with what to remember of training.
+
+        In half precision with the eight significant bits of bfloat16, which compress in a wheel.
 
         Args:
             path: to be written, ``.safetensors``.
             training: what to remember.
         """
         record = {"kind": _KIND, "sizes": asdict(self.size), "training": dict(training or {})}
-        save_tensors(path, {name: value.half() for name, value in self.state_dict().items()}, record)
+        save_tensors(path, {name: value.bfloat16().half() for name, value in self.state_dict().items()}, record)
 
     @staticmethod
     def load(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Segmenter:
