@@ -18,7 +18,7 @@ def test_weights_are_written_and_loaded(run, tmp_path, monkeypatch):
 
 
 def test_the_weights_of_another_shape_and_a_fixed_base_are_refused(run, folder, tmp_path):
-    weights = next((Path(tr.__file__).parent / "alignment").rglob("*hand*.safetensors"))
+    weights = next((Path(tr.__file__).parent / "alignment").rglob("hand_poses.safetensors"))
     for words, message in (
         (["align", "hand-left", folder / "cloud0.ply", "--initializer", weights], "another shape"),
         (["track", folder / "arm.urdf", folder / "arm.npz", "--initializer", weights], "another shape"),
