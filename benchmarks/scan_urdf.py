@@ -14,7 +14,6 @@ reference, moved by the file's own joints, lie from where they truly are, as med
     python benchmarks/scan_urdf.py --around --robot A.urdf B.urdf # robots of files, in random poses within limits
     python benchmarks/scan_urdf.py --around --robot strangers     # those of example-robot-data, or of --robots FOLDER
     python benchmarks/scan_urdf.py --data FOLDER                  # a hexapod's ten clouds, against its official URDF
-    python benchmarks/scan_urdf.py --calibrate --seeds 200 201 202 ... # fits the confidence of joints
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from confidence import area_under_curve
 from public_shapes import robots_folder
 from scan_robots import ROBOTS, camera_frame
 from scipy.optimize import least_squares, linear_sum_assignment
@@ -41,12 +39,9 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import invert_rigid
 from torchreg.io.urdf import load_urdf
 from torchreg.io.urdf_file.record import UrdfPrimitive
-from torchreg.registration.robots.model import RobotModel, find_robot
-from torchreg.registration.robots.reliability import JOINT_CALIBRATION
-from torchreg.registration.robots.surfaces import Target
+from torchreg.registration.robots.model import RobotModel
 from torchreg.shapes.posed_tree import PosedTree
 from torchreg.shapes.robots import solid_mesh
-from torchreg.solvers.calibration import fit_logistic
 
 STEP, SPLITS = 0.25, 3
 # Of clouds all around: points each, and joint angles at random up to so much, radians.
@@ -57,10 +52,6 @@ STRANGERS = {name: ROBOTS[name] for name in ("UR5", "Panda", "A1", "Allegro")} |
 }
 # A joint is right within so many degrees, and so much of the size; of the hexapod so many meters.
 DEGREES, SHARE, METERS = 5.0, 0.02, 0.010
-# Cost, about the size of an arm, from which a joint found is not a true one.
-APART = 0.1
-# Robots to which the confidence of joints is fitted: joints and frames from, to below, and points of a cloud.
-FEW, SPARSE = ((3, 7), (3, 6)), 1500
 
 
 @dataclass(frozen=True)
@@ -131,7 +122,7 @@ class Arm:
         return (frames[:, :3, :3] @ axes.unsqueeze(-1)).squeeze(-1), frames[:, :3, 3]
 
 
-def around(arm: Arm, generator: torch.Generator, points: int = POINTS) -> tuple[Arm, list[tr.RangeScan]]:
+def around(arm: Arm, generator: torch.Generator) -> tuple[Arm, list[tr.RangeScan]]:
     """Return an arm in random poses, and clouds of its whole surface, new points in each, without normals."""
     values = RANGE * (2 * torch.rand(len(arm.poses), arm.poses.shape[1] - 6, generator=generator).double() - 1)
     if isinstance(arm.tree, tr.ArticulatedShape):
@@ -142,8 +133,8 @@ def around(arm: Arm, generator: torch.Generator, points: int = POINTS) -> tuple[
     arm = replace(arm, poses=torch.nn.functional.pad(values, (6, 0)))
     clouds = []
     for frame in arm.placed():
-        dense = scattered(tr.TriangleMesh(frame, arm.faces), 12 * points, generator)
-        clouds.append(tr.RangeScan(dense[outside(dense)][:points]))
+        points = scattered(tr.TriangleMesh(frame, arm.faces), 12 * POINTS, generator)
+        clouds.append(tr.RangeScan(points[outside(points)][:POINTS]))
     return arm, clouds
 
 
@@ -201,46 +192,17 @@ def show_around(arm: Arm, name: str, seed: int) -> Score:
     angles, across, nearest = axis_errors(replace(arm, poses=arm.poses[found.reference :]), robot)
     right = (angles < DEGREES) & (across < SHARE * size)
     stds = torch.rad2deg(robot.axis_std)
-    sure = robot.confidence >= JOINT_CALIBRATION.doubtful
-    wrong = set(sure.nonzero()[:, 0].tolist()) - set(nearest[right].tolist())
+    wrong = {n for n in range(len(stds)) if stds[n] < DEGREES} - set(nearest[right].tolist())
     print(
         f"{name}: {int(right.sum())} of {len(right)} joints right, {len(stds)} found, axes off "
         f"{', '.join(f'{a:.2f}' for a in angles.tolist())} degrees, "
         f"{', '.join(f'{100 * a / size:.1f}' for a in across.tolist())} % of the size; stds found "
-        f"{', '.join(f'{a:.2f}' for a in stds.tolist())} degrees; {int(sure[nearest[right]].sum())} right ones sure, "
-        f"{len(wrong)} wrong ones; {robot.status}, {spent:.0f} CPU s",
+        f"{', '.join(f'{a:.2f}' for a in stds.tolist())} degrees, {len(wrong)} wrong ones below {DEGREES:.0f}; "
+        f"{found.status}, {spent:.0f} CPU s",
         flush=True,
     )
     errors = torch.stack([angles / stds[nearest], across / robot.origin_std[nearest]])[:, right]
     return Score(int(right.sum()), len(right), len(wrong), errors)
-
-
-def labeled_joints(seed: int) -> tuple[Tensor, Tensor]:
-    """Return the evidence (J, E) of the joints found of a made-up robot in a few sparse clouds, and which are right.
-
-    Nothing is registered: links are found from the base outward, which goes wrong where frames are few and far apart.
-    """
-    draw = torch.Generator().manual_seed(seed)
-    joints, frames = (int(torch.randint(low, high, (1,), generator=draw)) for low, high in FEW)
-    arm, scans = around(Arm.drawn(joints, frames, seed), draw, points=SPARSE)
-    own = [Target(scan.points, scan.normals) for scan in scans]
-    points, size = scans[0].points, float((scans[0].points.amax(0) - scans[0].points.amin(0)).norm())
-    part = torch.zeros(len(points), dtype=torch.long)
-    robot = find_robot(points, scans[0].normals, points.expand(frames, -1, -1), part, own, sparse=True)
-    angles, across, nearest = axis_errors(arm, robot)
-    right = torch.zeros(len(robot.evidence), dtype=torch.bool)
-    right[nearest[(angles < DEGREES) & (across < SHARE * size)]] = True
-    return robot.evidence, right
-
-
-def calibrate(seeds: list[int]) -> None:
-    """Print the logistic model of joints of made-up robots, and how it ranks those of every other one by the rest."""
-    cases = [labeled_joints(seed) for seed in seeds]
-    evidence, right = (torch.cat(rows) for rows in zip(*cases, strict=True))
-    half = torch.cat([torch.full((len(rows),), number % 2 == 0) for number, (rows, _) in enumerate(cases)])
-    print(f"{len(right)} joints, {int(right.sum())} right: {fit_logistic(evidence, right)}")
-    tested = fit_logistic(evidence[half], right[half]).probability(evidence[~half])
-    print(f"fitted to a half, area under the curve on the other {area_under_curve(tested, right[~half]):.3f}")
 
 
 def robot_files(names: list[str], folder: Path | None) -> list[Path]:
@@ -268,11 +230,10 @@ def show_hexapod(folder: Path, generator: torch.Generator | None) -> None:
     points = (first[:, :3, :3] @ robot.origins()[1:].unsqueeze(-1)).squeeze(-1) + first[:, :3, 3]
     angles, across = official_errors(folder / "robot_clouds/hexapod_official.urdf", directions, points)
     right = (angles < DEGREES) & (across < METERS)
-    sure = int((robot.confidence >= JOINT_CALIBRATION.doubtful).sum())
     print(
         f"hexapod, clouds {order.tolist()}: {int(right.sum())} of {len(right)} joints right, {len(axes)} found; the "
         f"right ones are off by {angles[right].median():.1f} degrees, {1000 * across[right].median():.1f} mm in the "
-        f"median; {sure} sure; {robot.status}, {spent:.0f} CPU s",
+        f"median; {found.status}, {spent:.0f} CPU s",
         flush=True,
     )
 
@@ -353,17 +314,14 @@ def rand_index(first: Tensor, second: Tensor) -> float:
 
 
 def axis_errors(arm: Arm, robot: RobotModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the angles (J,), degrees, and distances of the true axes from those found, and which are theirs."""
+    """Return the angles (J,), degrees, and distances of the true axes from the nearest found, and which those are."""
     axes, points = arm.axes()
     found = torch.tensor([joint.axis for joint in robot.tree.joints[1:]], dtype=torch.float64).reshape(-1, 3)
     off = robot.origins()[1:] - points.unsqueeze(1)
     across = (off - (off * axes.unsqueeze(1)).sum(-1, keepdim=True) * axes.unsqueeze(1)).norm(dim=-1)
     angle = (axes @ found.mT).abs().clamp_max(1).arccos()
-    # A radian counts as much as half a metre, about the size of an arm. Joints that share an axis have one each.
-    costs = 0.5 * angle + across
-    nearest = costs.argmin(1, keepdim=True)
-    rows, columns = (torch.from_numpy(index) for index in linear_sum_assignment(costs.clamp_max(APART)))
-    nearest[rows, 0] = torch.where(costs[rows, columns] < APART, columns, nearest[rows, 0])
+    # A radian counts as much as half a metre, about the size of an arm.
+    nearest = (0.5 * angle + across).argmin(1, keepdim=True)
     return torch.rad2deg(angle.gather(1, nearest)[:, 0]), across.gather(1, nearest)[:, 0], nearest[:, 0]
 
 
@@ -420,14 +378,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--around", action="store_true", help="clouds of the whole surface, without normals, in any order"
     )
-    parser.add_argument("--calibrate", action="store_true", help="fit the confidence of joints to made-up robots")
     parser.add_argument("--data", type=Path, help="folder of robot_clouds: its hexapod")
     parser.add_argument("--shuffled", action="store_true", help="the hexapod's clouds in a random order")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of a robot's steps")
     options = parser.parse_args(arguments)
-    if options.calibrate:
-        calibrate(options.seeds)
-        return 0
     files = robot_files(options.robot or [], options.robots)
     if options.data:
         for seed in options.seeds:
@@ -444,7 +398,7 @@ def main(arguments: list[str] | None = None) -> int:
         (direction, place), (most, farthest) = errors.quantile(torch.tensor([0.5, 0.95]).double(), dim=1)
         print(
             f"{sum(score.right for score in scores)} of {sum(score.joints for score in scores)} joints right, "
-            f"{sum(score.sure for score in scores)} wrong ones sure; directions off by "
+            f"{sum(score.sure for score in scores)} wrong ones below {DEGREES:.0f} degrees; directions off by "
             f"{direction:.1f} stds in the median, {most:.1f} in 95 of 100, places by {place:.1f} and {farthest:.1f}"
         )
         return 0

@@ -1,7 +1,6 @@
 """Robots found in registered scans: kinds of joints, axes, limits, and the file that moves as the scans did."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import pytorch_kinematics as pk
@@ -74,8 +73,6 @@ def test_kinds_axes_and_values_of_joints_are_found(scans, found):
         assert 0 <= float(found.origin_std[place]) < 0.02
     assert rand_errors(torch.tensor([0, 1, 2, 2, 3])[part], found.part) < 0.01
     assert found.loose == found.undetermined == ()
-    assert float(found.confidence.min()) > 0.9
-    assert found.status is tr.Status.CONVERGED
     # Whatever the root, a joint's value is that of the truth but for its sign.
     spread = sorted(float((column - column[0]).abs().max()) for column in found.joint_values.mT)
     expected = sorted(float(values[:, k].abs().max()) for k in (0, 1, 3))
@@ -84,20 +81,6 @@ def test_kinds_axes_and_values_of_joints_are_found(scans, found):
     for joint, column in zip(found.tree.joints[1:], found.joint_values.mT, strict=True):
         assert joint.lower < float(column.min())
         assert joint.upper > float(column.max())
-
-
-def test_joints_are_doubtful_whose_axes_or_links_the_scans_do_not_show(found):
-    right = found.evidence[0]
-    assert float(right.max()) < 0.5
-    for number in range(3):
-        wrong = right.clone()
-        wrong[number] = 1.0
-        other = replace(found, evidence=torch.stack([right, wrong]))
-        assert float(other.confidence[1]) < float(other.confidence[0])
-    # Stds that are infinite, as of links that are not where the joints put them.
-    lost = replace(found, evidence=torch.stack([right, torch.tensor([1.0, 1.0, right[2]]).double()]))
-    assert float(lost.confidence[1]) < 0.5
-    assert lost.status is tr.Status.DOUBTFUL
 
 
 def test_the_file_moves_as_the_scans_did(scans, found, tmp_path):

@@ -241,8 +241,7 @@ class SequenceRegistration(Result):
         Returns:
             A record: the kinematic ``tree``, the ``part`` (N,) of each point, ``joint_values`` (T, J), radians and
             metres, the ``base`` (T, 4, 4) of each frame, the ``residuals`` (T,), median distances from the scans,
-            metres, ``loose``, the names of joints that do not explain how their links move, and the ``confidence`` (J,)
-            that each joint is right, with a ``status``: DOUBTFUL if any is below one half.
+            metres, and ``loose``, the names of joints that do not explain how their links move.
 
         Raises:
             FormatError: if the ending is not .urdf.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import NeighborTree, sampling_distance
-from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
+from torchreg.geometry.neighbors import NeighborTree
+from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces
 from torchreg.solvers.graph_cut import alpha_expansion
 
 
@@ -43,54 +43,8 @@ def labeled(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, as
     unary = 0.5 * squares.clamp_max(NUMBERS.cut**2).sum(0) / noise.repeats
     count = len(surfaces.targets) * len(surfaces.samples) / noise.repeats
     weights = unary.new_full((len(surfaces.edges),), border_cost(surfaces.edges, label))
-    costs = unary.new_full((motions.shape[1],), hinge_price(len(squares), count))
+    costs = unary.new_full((motions.shape[1],), 0.5 * (len(squares) + 4.0) * math.log(max(count, 2.0)))
     return alpha_expansion(unary, surfaces.edges, weights, label_costs=costs, initial=label).labels
-
-
-def hinge_price(frames: int, count: float) -> float:
-    """Return the cost of a hinge's parameters, four of its axis and a value a frame, by residuals (Schwarz 1978)."""
-    return 0.5 * (frames + 4.0) * math.log(max(count, 2.0))
-
-
-def merge_losses(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise) -> tuple[Tensor, Tensor]:
-    """Return what the scans' points cost more (K,) if a link moved as a link beside it, and the best of these (K,).
-
-    In prices of a hinge's parameters: below one a link does not pay for itself. Samples that scans hide do not show
-    where they are; a motion that lays them on another link's surface explains nothing that this link does not.
-    """
-    count, spacing = motions.shape[1], sampling_distance(surfaces.samples)
-    own = [label == link for link in range(count)]
-    parts = [Target(surfaces.samples[o], surfaces.normals[o], signed=False, spacing=spacing) for o in own]
-
-    def compared(link: int, mover: int) -> Tensor:
-        distances, squares = surfaces.uncovered(parts[link], motions[:, mover], NUMBERS.cut * noise.sigma)
-        return torch.stack([distances, 0.5 * (squares / noise.sigma**2).clamp_max(NUMBERS.cut**2) / noise.repeats])
-
-    # The nearest sample is compared: the better of two would be better than either by noise alone.
-    distances, costs = torch.stack([compared(link, link) for link in range(count)], 1)
-    near = distances.topk(min(2, count), 0, largest=False).indices
-    before = costs.gather(0, near[:1])[0]
-    price = hinge_price(len(motions), costs.shape[1] / noise.repeats)
-    ends = label[surfaces.edges]
-    losses = torch.full((count, count), torch.inf, dtype=torch.float64)
-    for link, beside in torch.cat([ends, ends.flip(1)]).unique(dim=0).tolist():
-        if link != beside:
-            others = torch.where(near[0] == link, near[1], near[0]).unsqueeze(0)
-            moved = compared(link, beside)
-            after = torch.where(moved[0] < distances.gather(0, others)[0], moved[1], costs.gather(0, others)[0])
-            losses[link, beside] = (after - before).sum() / price
-    best = losses.min(1)
-    return best.values, best.indices
-
-
-def without_idle(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise) -> tuple[Tensor, Tensor]:
-    """Return motions and labels without links that do not pay for themselves in points of the scans."""
-    while True:
-        losses, beside = merge_losses(surfaces, motions, label, noise)
-        idle = int(losses.argmin())
-        if losses[idle] >= 1:
-            return motions, label
-        motions, label = without_gaps(motions, torch.where(label == idle, beside[idle], label))
 
 
 def border_cost(edges: Tensor, label: Tensor) -> float:
@@ -121,7 +75,7 @@ def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tens
         motions, label = without_gaps(proposals, labeled(surfaces, proposals, label, noise, asked))
         if number >= LINKS.splits and torch.equal(before, label):
             break
-    return *without_idle(surfaces, motions, label, noise), noise
+    return motions, label, noise
 
 
 def _pieces(surfaces: Surfaces, motions: Tensor, label: Tensor, scales: list[float]) -> tuple[Tensor, Tensor]:

@@ -25,9 +25,7 @@ from torchreg.registration.robots.fusion import FusedScans
 from torchreg.registration.robots.growth import GROWTH, Growth, grown
 from torchreg.registration.robots.joints import Candidate, best_joint, from_ground, relative
 from torchreg.registration.robots.links import find_links, labeled, without_gaps
-from torchreg.registration.robots.reliability import JOINT_CALIBRATION, joint_evidence
 from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces, Target
-from torchreg.result import Status
 from torchreg.shapes.posed_tree import PosedTree
 
 
@@ -60,20 +58,8 @@ class RobotModel:
     residuals: Tensor
     axis_std: Tensor  # (J,) standard deviations of the joints' axes, radians, where the links are right
     origin_std: Tensor  # (J,) the same of where a hinge's axis lies, at its link's origin, in the scans' unit
-    evidence: Tensor  # (J, 3) what speaks against each joint, see `joint_evidence`
     # names of the joints whose links move in more ways about each other than one joint allows
     loose: tuple[str, ...] = ()
-
-    @property
-    def confidence(self) -> Tensor:
-        """Probability (J,) that each joint is right: its axis to five degrees, and to two hundredths of the size."""
-        return JOINT_CALIBRATION.probability(self.evidence)
-
-    @property
-    def status(self) -> Status:
-        """DOUBTFUL if any joint is, else CONVERGED."""
-        doubtful = bool((self.confidence < JOINT_CALIBRATION.doubtful).any())
-        return Status.DOUBTFUL if doubtful else Status.CONVERGED
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -159,11 +145,9 @@ def find_robot(
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
     found = _described(mechanism, points, link, frames, residuals, loose)
-    stds = axis_stds(*fit, label, found.origins())
-    evidence = joint_evidence(surfaces, mechanism, label, stds)
-    # Standard deviations hold for links that are right; one that most scans do not show there is not.
-    axis, origin = (std[1:].where(evidence[:, -1] <= 0.5, torch.inf) for std in stds)
-    return replace(found, axis_std=axis, origin_std=origin, evidence=evidence)
+    axis, origin = axis_stds(*fit, label, found.origins())
+    shown = _shown(surfaces, mechanism, label)[1:]
+    return replace(found, axis_std=axis[1:].where(shown, torch.inf), origin_std=origin[1:].where(shown, torch.inf))
 
 
 def with_grown_links(surfaces: Surfaces, motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
@@ -259,6 +243,23 @@ def assembled(
     return mechanism, place[label]
 
 
+def _shown(surfaces: Surfaces, mechanism: Mechanism, label: Tensor) -> Tensor:
+    """Return for each link whether the scans show it and its parent where the joints put them.
+
+    Standard deviations hold for links that are right; one that most scans do not show there is not.
+    """
+    motions, parents = mechanism.motions(), mechanism.parents
+    costs = Growth(surfaces, motions, label).costs(motions).gather(1, label.unsqueeze(1))[:, 0]
+    count = torch.bincount(label, minlength=len(parents))
+    shares = torch.zeros(len(parents)).double().index_add(0, label, (costs > GROWTH.explained).double()) / count
+    # A link without samples is as right as the next.
+    own = [bool(share <= 0.5) for share in shares]
+    for link in reversed(range(1, len(parents))):
+        if not count[parents[link]]:
+            own[parents[link]] = own[link]
+    return torch.tensor([own[link] and own[max(parent, 0)] for link, parent in enumerate(parents)])
+
+
 def _loose(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> tuple[bool, ...]:
     """Return for each link whether the data speak for a free motion about its parent rather than for any joint."""
     scale = NUMBERS.cut * noise.sigma
@@ -301,7 +302,6 @@ def _described(
         residuals=residuals,
         axis_std=torch.zeros(len(joints) - 1, dtype=torch.float64),
         origin_std=torch.zeros(len(joints) - 1, dtype=torch.float64),
-        evidence=torch.ones(len(joints) - 1, 3, dtype=torch.float64),
         loose=tuple(names),
     )
 

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchreg.geometry.graphs import component_links, connected_components
 from torchreg.geometry.neighbors import NeighborTree, k_nearest_others, sampling_distance
-from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.registration.blend import turn_about
 from torchreg.solvers.robust import geman_mcclure_loss, geman_mcclure_weight
 
@@ -36,9 +35,9 @@ NUMBERS = SurfaceNumbers()
 class Target:
     """A scan to be compared with; where normals are estimates, whole links may have the other sign: it is not used."""
 
-    def __init__(self, points: Tensor, normals: Tensor, *, signed: bool = True, spacing: float | None = None) -> None:
+    def __init__(self, points: Tensor, normals: Tensor, *, signed: bool = True) -> None:
         self.points, self.normals, self.signed = points, normals, signed
-        self.spacing = sampling_distance(points) if spacing is None else spacing
+        self.spacing = sampling_distance(points)
         self.tree = NeighborTree(points)
 
     def facing(self, normals: Tensor) -> Target:
@@ -173,18 +172,6 @@ class Surfaces:
         for row, target, frame in zip(squares, self.targets, motions, strict=True):
             row[which, number] = target.residuals(*own.moved(frame[number]), reach)[2]
         return squares
-
-    def uncovered(self, part: Target, motions: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-        """Return distances (M,) of all scans' points from a part of the samples under motions (T, 4, 4), and squares.
-
-        These are as in `Target.residuals`; beyond reach both are infinite.
-        """
-        distances, squares = [], []
-        for target, back in zip(self.targets, invert_rigid(motions), strict=True):
-            points = transform_points(back, target.points)
-            distances.append(part.tree.nearest_within(points, reach + part.spacing)[1])
-            squares.append(part.residuals(points, target.normals, reach)[2])
-        return torch.cat(distances), torch.cat(squares)
 
     def noise(self, motions: Tensor, label: Tensor) -> Noise:
         """Return the noise of the samples' residuals under the motions (T, K, 4, 4) of their parts (n,)."""
