@@ -21,7 +21,7 @@ from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface
 from torchreg.alignment.inputs import are_degenerate, check_clouds, check_skin
 from torchreg.alignment.search.pose_proposer import PoseProposer, shipped_proposer
 from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, typical_poses
-from torchreg.alignment.search.start_source import best_proposal
+from torchreg.alignment.search.start_source import PROPOSAL_FIT, fitted_proposals, with_proposed_prior
 from torchreg.errors import InputError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.shapes.articulated import ArticulatedShape
@@ -284,9 +284,13 @@ class PoseInitializer(nn.Module):
                 self.skin, cloud, known, shifted(typical.expand(len(rows), -1), origin), origin,
                 prior_std=self.config.find_pose.prior_std, pose_atol=0.0,
             )  # fmt: skip
-            best = best_proposal(problem, proposer.propose(problem.data, known))
-            confidence = torch.where(known.any(-1), pose_confidence(problem, best.pose, best.lead), 0.0)
-            parts.append((shifted(best.pose, origin), shifted(best.mean, origin), confidence))
+            proposals = proposer.propose(problem.data, known)
+            informed = with_proposed_prior(problem, proposals)
+            found = fitted_proposals(informed, proposals, PROPOSAL_FIT.kept)
+            best = found.poses[:, 0]
+            mean = torch.cat([best[:, :BASE_DOFS], informed.prior.mean[:, BASE_DOFS:]], dim=-1)
+            confidence = torch.where(known.any(-1), pose_confidence(problem, best, found.lead()), 0.0)
+            parts.append((shifted(best, origin), shifted(mean, origin), confidence))
         poses, means, confidences = zip(*parts, strict=True)
         return torch.cat(poses), torch.cat(means), torch.cat(confidences)
 

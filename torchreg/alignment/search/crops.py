@@ -16,7 +16,12 @@ from torchreg.alignment.search.multi_start import SEARCH_BUDGET
 from torchreg.alignment.search.pose_proposer import PoseProposer, Proposals
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.segmenter import shipped_segmenter
-from torchreg.alignment.search.start_source import StartSource, best_proposal
+from torchreg.alignment.search.start_source import (
+    PROPOSAL_FIT,
+    StartSource,
+    fitted_proposals,
+    with_proposed_prior,
+)
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import SurfaceGrid, candidate_crops
 from torchreg.capture.free_space import FreeSpace
@@ -159,7 +164,8 @@ def _proposed_crops(grid: SurfaceGrid, skin: LinearBlendSkin, proposer: PoseProp
     proposals = windows.proposed(proposer)
     frames = [grid.frame.near(center.double()) for center in windows.centers]
     problem = windows.problem(skin, frames)
-    poses = best_proposal(problem, proposals).pose
+    fitted = fitted_proposals(with_proposed_prior(problem, proposals), proposals, PROPOSAL_FIT.kept)
+    poses = fitted.poses[:, 0]
     views = _tables(problem, poses, frames)
     elsewhere = 1 - proposals.inlier.sum(-1) / windows.valid.sum(-1).clamp_max(proposals.inlier.shape[-1])
     odds = WINDOW_MODEL.log_odds(torch.cat([views, elsewhere.unsqueeze(-1)], dim=-1)).exp()

@@ -26,7 +26,6 @@ from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, PoseSource, U
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.solvers.e_step import EStep
 
 
@@ -34,53 +33,37 @@ from torchreg.solvers.e_step import EStep
 class _Fit:
     """Numbers of the fit; widths are shares of the model's size."""
 
-    kept: int = 2  # most probable proposals, beside that fitted to matches
+    kept: int = 2  # most probable proposals where there is no time for all, beside that fitted to matches
     surface_std: float = 0.015  # of where the network says that a datum lies on the shape
     reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
     joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
     matched_steps: int = 2  # in each round
 
 
-_FIT = _Fit()
+PROPOSAL_FIT = _Fit()
 # From what a proposal errs by to a searched pose's width.
 _PLAN = Plan(start=0.05, stop=0.02, steps=2)
 
 
-@dataclass(frozen=True, eq=False)
-class BestProposal:
-    """The pose (B, num_dofs) that explains most data, the mean of its prior, and its lead (B,) over the next."""
-
-    pose: Tensor
-    mean: Tensor
-    lead: Tensor
-
-
 @torch.no_grad()
-def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
-    """Return the pose that explains most data after a coarse fit, with the network's joints as the prior."""
-    told = with_proposed_prior(problem, proposals)
-    coarse = PoseSearch(told, torch.Generator().manual_seed(0)).coarse_problem
-    poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
-    pool = torch.cat([matched_pose(told, proposals).unsqueeze(1), poses], dim=1)
-    fitted = Candidates.descended(coarse, pool, _PLAN)
-    share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
-    best = fitted.poses[:, 0]
-    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), fitted.lead() * share)
+def fitted_proposals(problem: AlignProblem, proposals: Proposals, most: int | None = None) -> Candidates:
+    """Return the ``most`` probable poses of a network, and that of its matches, after a coarse fit, best first.
 
-
-@torch.no_grad()
-def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
-    """Return ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first."""
+    The problem is one `with_proposed_prior`.
+    """
     coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
-    pool = torch.cat([problem.clamp_candidates(proposals.poses), matched_pose(problem, proposals).unsqueeze(1)], dim=1)
-    fitted = Candidates.descended(coarse, pool, _PLAN).distinct(SEARCH_BUDGET.same, count)
-    return torch.cat([fitted.poses, fitted.poses[:, -1:].expand(-1, count - fitted.poses.shape[1], -1)], dim=1)
+    poses = problem.clamp_candidates(proposals.poses[:, :most])
+    pool = torch.cat([matched_pose(problem, proposals).unsqueeze(1), poses], dim=1)
+    fitted = Candidates.descended(coarse, pool, _PLAN)
+    # Each of the few data stands for several.
+    share = problem.valid.sum(-1, keepdim=True) / coarse.valid.sum(-1, keepdim=True).clamp_min(1)
+    return replace(fitted, costs=fitted.costs * share)
 
 
 def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
     """Return a problem whose prior's mean is the most probable proposal, except in joints with a prior."""
     mean = problem.clamp_candidates(proposals.poses[:, :1])[:, 0]
-    precision = joint_precision(problem.skin.shape, problem.size, _FIT.joint_std)
+    precision = joint_precision(problem.skin.shape, problem.size, PROPOSAL_FIT.joint_std)
     if problem.prior_precision is None:
         return replace(problem, prior=GaussianPosePrior(mean, precision))
     told, prior = problem.prior_precision > 0, problem.prior
@@ -95,10 +78,10 @@ def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
     """
     skin, sigma, pose = problem.skin, ANNEALING.stop * problem.size, problem.prior.mean
     near = torch.cdist(proposals.surface, skin.points).square()
-    share = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1)
+    share = (near / (-2 * (PROPOSAL_FIT.surface_std * problem.size) ** 2)).softmax(-1)
     share, index = share.topk(int((share > torch.finfo(share.dtype).eps).sum(-1).max()), sorted=False)
     told, index, points = share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2)
-    for width in (None, *_FIT.reach):
+    for width in (None, *PROPOSAL_FIT.reach):
         weight = told
         if width is not None:
             far = (points - take_rows(skin(pose), index).unflatten(1, told.shape[1:])).square().sum(-1)
@@ -109,7 +92,7 @@ def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
         targets = sums[..., :3] / total.clamp_min(1e-9).unsqueeze(-1)
         matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
         objective = registration_objective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
-        for _ in range(_FIT.matched_steps):
+        for _ in range(PROPOSAL_FIT.matched_steps):
             pose = problem.step(objective(pose), pose).state
     return pose
 
@@ -154,7 +137,8 @@ class StartSource:
             return problem, problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
         proposals = self.proposer.propose(problem.data, problem.valid)
         problem = with_proposed_prior(problem, proposals)
-        return problem, self._substituted(problem, best_proposals(problem, proposals, count))
+        found = fitted_proposals(problem, proposals).distinct(SEARCH_BUDGET.same, count).poses
+        return problem, self._substituted(problem, found)
 
     def _substituted(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(
