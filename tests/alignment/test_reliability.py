@@ -2,15 +2,22 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 import torchreg as tr
 from tests.alignment.conftest import DESCENT
 from tests.alignment.made import joint, shape_of, solid
+from torchreg.alignment.evidence.confidence import SurfaceResiduals
+from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
+from torchreg.alignment.fit.problem import centered_problem
+from torchreg.datasets.hand import surface_skin
 from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.visibility import visible_points
 
 FREE = tr.AlignConfig(search="never", prior_std=None)
 
@@ -51,6 +58,33 @@ def test_evidence_is_none_at_the_truth_and_speaks_against_a_wrong_pose(links, li
     assert right.status is tr.Status.CONVERGED
     assert float(right.evidence[3]) < 0.1 < 0.4 < float(wrong.evidence[3])  # off the surface
     assert float(right.confidence) > 0.9 > 0.5 > float(wrong.confidence)
+
+
+def test_surface_without_data_counts_as_unseen_where_a_camera_would_see_it(plain_hand):
+    """Beside visibility by rasterizing: half a cloud misses what it would show."""
+    skin, pose = surface_skin(plain_hand), plain_hand.rest_pose()
+    pose[:6] = torch.tensor([0.0, 0.0, 0.8, 0.4, 2.0, -0.3])
+    mesh = tr.TriangleMesh(skin(pose), skin.faces)
+    seen = visible_points(mesh, mesh.vertices, torch.zeros(3))
+    data = mesh.vertices[seen]
+    above = data[:, 0] > data[:, 0].median()
+    clouds = torch.stack([data, torch.where(above.unsqueeze(-1), data, torch.nan)])
+    valid = torch.stack([torch.ones_like(above), above])
+    poses = pose.expand(2, -1)
+    problem = centered_problem(
+        skin, clouds.nan_to_num(), valid, poses, torch.zeros(2, 3), prior_std=None, pose_atol=0.0
+    )  # fmt: skip
+    residuals = SurfaceResiduals.of(problem, poses)
+    shares = unseen_share(problem, poses, residuals.distance, residuals.jacobian, -normalize(skin(poses), dim=-1))
+    far = torch.cdist(data, data[above]).amin(-1) > 0.04 * problem.size
+    assert float(shares[0]) < 0.01
+    assert float(shares[1]) == pytest.approx(float(far.float().mean()), abs=0.05)
+    alone = replace(residuals, distance=residuals.distance[1:], jacobian=residuals.jacobian[1:])
+    row = problem.rows(torch.tensor([1]))
+    assert torch.equal(
+        unseen_share(row, poses[1:], alone.distance, alone.jacobian),
+        unseen_share(problem, poses, residuals.distance, residuals.jacobian)[1:],
+    )
 
 
 def test_a_fit_goes_on_where_another_step_would_gain(links, links_skin, measured):

@@ -9,7 +9,7 @@ import torchreg as tr
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.limbs import find_limbs
-from torchreg.tracking.evidence import LimbReach, UnexplainedClusters, presence, unseen_share
+from torchreg.tracking.evidence import LimbReach, UnexplainedClusters, presence, presence_evidence
 from torchreg.tracking.frame import Frame
 
 CELL = 0.01
@@ -129,7 +129,7 @@ def shown(arm, skin, cloud, pose):
     made = tr.Tracker(arm, model_points=skin)
     frame = Frame(cloud=cloud, finite=torch.ones(len(cloud), dtype=torch.bool), elapsed=1.0)
     fit = made._fitter.fit_at(made.state, frame, pose, "found")
-    return float(unseen_share(fit)), presence(fit)
+    return float(presence_evidence(fit)[0]), presence(fit)
 
 
 def test_presence_counts_the_surface_that_faces_the_data_and_has_none(arm, tracking):

@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchreg.alignment.evidence.confidence import CLUSTERS, OFF_SURFACE
-from torchreg.alignment.evidence.picture_agreement import visible_points
-from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem
+from torchreg.alignment.evidence.coverage import unseen_share
+from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET
-from torchreg.geometry.neighbors import NeighborTree, nearest_neighbor, sampling_distance
+from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.skin import LinearBlendSkin
@@ -172,26 +172,10 @@ def presence(fit: FrameFit) -> float:
 
 def presence_evidence(fit: FrameFit) -> Tensor:
     """Return the evidence (2,) of a `PresenceModel`."""
-    return torch.stack([unseen_share(fit), SURFACE_FIT.relative_noise(fit.residual, fit.view.problem.size)])
-
-
-def unseen_share(fit: FrameFit) -> Tensor:
-    """Return the share () that no data lie near of the surface that a camera sees from the side of the data.
-
-    Where no camera is known, that side is where the surface faces on which the data lie.
-    """
-    problem = fit.view.problem
-    near = fit.distance[0].abs() < INLIER_SHARE * problem.size
-    posed = problem.skin(fit.pose)[0]
-    if fit.view.viewpoint is None:
-        toward = normalize(-normalize(fit.jacobian[0, near, :3], dim=-1).sum(0), dim=0)
-    else:
-        toward = normalize(fit.view.viewpoint.to(posed) - posed, dim=-1)
-    visible = visible_points(problem, fit.pose, toward)
-    if not bool(near.any()) or not bool(visible.any()):
-        return torch.ones_like(fit.residual)
-    apart = NeighborTree(problem.data[0, near]).nearest(posed[visible])[1]
-    return (apart > 2 * INLIER_SHARE * problem.size).to(posed).mean()
+    problem, viewpoint = fit.view.problem, fit.view.viewpoint
+    toward = None if viewpoint is None else normalize(viewpoint.to(fit.pose) - problem.skin(fit.pose), dim=-1)
+    unseen = unseen_share(problem, fit.pose, fit.distance, fit.jacobian, toward)[0]
+    return torch.stack([unseen, SURFACE_FIT.relative_noise(fit.residual, problem.size)])
 
 
 def deviates_far(fit: FrameFit, state: TrackState) -> bool:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.confidence import limb_points
+from torchreg.alignment.evidence.coverage import shape_normals, visible_points
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
@@ -27,9 +28,6 @@ class _Look:
     """How surfaces are compared; lengths are shares of the shape's size."""
 
     on_shape: float = 0.03  # distance of data on the shape: a fit of another hand errs by .02
-    facing: float = 0.3  # cosine between a normal and the direction to the camera of a visible surface, at least
-    nearest_ray: float = 0.04  # first step towards the camera in which the shape may hide itself; each is twice as long
-    num_rays: int = 5
     num_data: int = 800  # whose normals are compared
     around: int = 16  # neighbors that give a normal
     detail: float = 0.12  # radius within which normals are compared with their mean
@@ -185,7 +183,7 @@ class _Surface:
         """Return what a picture shows where the surface of a pose (1, num_dofs) would be."""
         posed = problem.skin(pose)[0]
         toward = torch.nn.functional.normalize(frame.camera.position.to(posed) - posed, dim=-1)
-        visible = visible_points(problem, pose, toward)
+        visible = visible_points(problem, pose, toward[None])[0]
         pixels, depth = frame.camera.project(posed)
         column, row = pixels.nan_to_num(-1).round().long().unbind(-1)
         height, width = frame.depth.shape
@@ -214,22 +212,6 @@ class _Surface:
         return ((which & self.known).sum() / self.known.sum().clamp_min(1)).to(self.gap)
 
 
-def visible_points(problem: AlignProblem, pose: Tensor, toward: Tensor) -> Tensor:
-    """Return which points (N,) of the skin in a pose (1, num_dofs) a camera in directions (N, 3) or (3,) would see."""
-    posed = problem.skin(pose)
-    normal, posed = _shape_normals(problem, pose, posed)[0], posed[0]
-    steps = _LOOK.nearest_ray * 2.0 ** torch.arange(_LOOK.num_rays).to(posed)
-    rays = posed + problem.size * steps[:, None, None] * toward
-    clear = problem.surface.distance(rays.reshape(1, -1, 3), pose).reshape(len(rays), -1) > 0
-    return ((normal * toward).sum(-1) > _LOOK.facing) & clear.all(0)
-
-
-def _shape_normals(problem: AlignProblem, pose: Tensor, points: Tensor) -> Tensor:
-    """Return unit normals (1, N, 3) of the surface next to points (1, N, 3): the base's translation moves it so."""
-    slope = -problem.surface.distance_jacobian(points, pose)[1][..., :3]
-    return torch.nn.functional.normalize(slope, dim=-1)
-
-
 def _normal_agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean cosine between normals of data and shape, and the correlation and log ratio of their details.
 
@@ -245,7 +227,7 @@ def _normal_agreement(problem: AlignProblem, pose: Tensor, frame: DepthFrame) ->
     data, normals = data[::stride], normals[::stride]
     toward = frame.camera.position.to(data) - data
     normals = torch.where((toward * normals).sum(-1, keepdim=True) < 0, -normals, normals)
-    expected = _shape_normals(problem, pose, data[None])[0]
+    expected = shape_normals(problem, pose, data[None])[0]
     index, apart = k_nearest_others(data, min(_LOOK.neighbors, len(data) - 1))
     near = (apart < _LOOK.detail * problem.size).to(data).unsqueeze(-1)
     measured, wanted = (n - (n + (n[index] * near).sum(1)) / (1 + near.sum(1)) for n in (normals, expected))

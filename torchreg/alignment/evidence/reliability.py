@@ -21,6 +21,7 @@ from torchreg.alignment.evidence.confidence import (
     limb_points,
     near_outlier_share,
 )
+from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import (
     Curvature,
     curvature,
@@ -52,6 +53,7 @@ class Evidence:
         clusters: root of the data in dense clusters off the surface, as a share of those on it.
         off: share of the data that are not on the surface.
         free_space: root of the data that points in free space stand for, as a share of the data.
+        unseen: see `unseen_share`; zero where pictures tell what is there.
         unknown: probability that the data do not determine the ends of the limbs.
         rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
         open_rim: square of `open_rims`; zero for clouds.
@@ -65,6 +67,7 @@ class Evidence:
     clusters: Tensor
     off: Tensor
     free_space: Tensor
+    unseen: Tensor
     unknown: Tensor
     rival: Tensor
     rival_share: Tensor
@@ -102,7 +105,7 @@ class Calibration(Logistic):
 
     bias: float = 5.35
     # As `Evidence` has them.
-    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93, 20.44, 3.78, 0.0, 0.0)
+    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 0.0, 5.48, 1.03, 3.93, 20.44, 3.78, 0.0, 0.0)
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
@@ -119,7 +122,7 @@ CALIBRATION = Calibration()
 # 183 of crops that were not segmented yet, all of hands. Families differ by less than their errors: hands by .6 (.7),
 # arms by -.2 (.6) of the log-odds.
 PICTURE_CALIBRATION = Calibration(
-    bias=4.53, weights=(1.83, 2.85, 1.13, 0.22, 6.96, 1.87, 0.0, 1.98, 6.08, 1.33, 6.46, 2.8)
+    bias=4.53, weights=(1.83, 2.85, 1.13, 0.22, 6.96, 0.0, 1.87, 0.0, 1.98, 6.08, 1.33, 6.46, 2.8)
 )
 # Of fits of pose and shape together, which are right if all of the surface, hidden parts too, is off by at most that
 # share of the size on average: 25 mm of a body of 1.7 m. What is unknown is then the standard error of the surface,
@@ -127,7 +130,7 @@ PICTURE_CALIBRATION = Calibration(
 # `benchmarks/shape_confidence.py --calibrate` fits one to what it draws; its area under the curve on 72 others, a third
 # of them searched, is .96. Pictures and rivals were not among the 59: their weights are those of poses.
 SHAPE_CALIBRATION = Calibration(
-    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.44, 3.78, 4.0, 0.0), right=0.015
+    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 0.0, 10.78, 1.03, 3.93, 20.44, 3.78, 4.0, 0.0), right=0.015
 )
 
 
@@ -220,6 +223,8 @@ def judge(
             evidence = replace(evidence, elsewhere=picture.elsewhere.square(), misplaced=picture.misplaced.mean(-1))
         residuals = replace(residuals, contradicted=picture.contradicted)
         loose = loose | (picture.misplaced > CALIBRATION.doubtful)
+    else:
+        evidence = replace(evidence, unseen=unseen_share(problem, pose, residuals.distance, residuals.jacobian))
     around, calibration = curvature(problem, pose, residuals), PICTURE_CALIBRATION if in_picture else CALIBRATION
     converged, shape = around.converged, problem.skin.shape
     if error is not None:
@@ -275,7 +280,7 @@ def weigh(
     count = problem.valid.sum(-1).clamp_min(1).to(distance)
     near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
     lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
-    unasked = dict.fromkeys(("open_rim", "planes", "elsewhere", "misplaced"), torch.zeros_like(noise))
+    unasked = dict.fromkeys(("open_rim", "planes", "elsewhere", "misplaced", "unseen"), torch.zeros_like(noise))
     return Evidence(
         noise=SURFACE_FIT.relative_noise(noise, problem.size),
         beside=near_outlier_share(problem, distance).sqrt(),
