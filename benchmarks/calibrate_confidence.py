@@ -3,10 +3,11 @@
     python benchmarks/calibrate_confidence.py --data SHARED --rooms 80 --count 200   # prints all models; hours
     python benchmarks/calibrate_confidence.py --smoke              # 3 rooms, 6 others: 30 CPU s, to see that it runs
 
-Alignments are drawn as by confidence.py (clouds and cut pictures of hands, with SHARED a robot arm and a fox) and by
-scenes.py, on seeds that neither measures: hands among other things, hands that hold things, arms, and rooms without
-them. In a room every crop that is tried counts, not the answer alone. What each is judged by is kept, so that it
-is judged again by the models fitted before it:
+Alignments are drawn as by confidence.py (clouds and cut pictures of hands, with SHARED a robot arm and a fox), by
+company.py (with SHARED: clouds of any rig alone, among others, and of others) and by scenes.py, on seeds that none
+measures: hands among other things, hands that hold things, arms, and rooms without them. In a room every crop that is
+tried counts, not the answer alone. What each is judged by is kept, so that it is judged again by the models fitted
+before it:
 
 1. `LimbModel`: whether the end of a limb is off by at most a tenth of the shape's size, where most limbs are right;
 2. `PictureModel`: whether a pose lies about on the shape, at even odds before;
@@ -34,6 +35,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
+import company
 from confidence import Drawn, Subject, area_under_curve, ends_of, observed, subjects, turns
 from scenes import cases
 
@@ -137,6 +139,17 @@ def alone(thing: Subject, seed: int) -> Iterator[Judged]:
     )  # fmt: skip
 
 
+def in_company(data: Path, seed: int) -> Iterator[Judged]:
+    """Yield the judgement of a cloud that may show other things, too, or instead."""
+    asked = company.scene(data, seed)
+    calls, _ = recorded(lambda: tr.align(asked.thing.shape, asked.data, asked.start, model_points=asked.thing.skin))
+    right = asked.is_right(world_pose(calls[-1]))
+    yield Judged(
+        kind=asked.place, family="rig" if asked.thing.name.endswith(".glb") else asked.thing.name, seed=seed,
+        told=calls[-1], ends=None, right=right, near=right, is_answer=True,
+    )  # fmt: skip
+
+
 def looked_at(cases: Sequence[Judged]) -> list[Judged]:
     """Return the cases with a picture, with how it agrees."""
     for case in cases:
@@ -180,14 +193,14 @@ def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
     """
     told = [case for case in cases if not case.in_room or case.told[2] is not None]
     rooms = by_family([case for case in told if case.in_room], reliability.PICTURE_CALIBRATION)
-    return rooms | by_family([case for case in told if not case.in_room])
+    return rooms | by_family([case for case in told if not case.in_room], reliability.CALIBRATION)
 
 
-def by_family(cases: Sequence[Judged], before: Calibration | None = None) -> dict[str, Calibration]:
+def by_family(cases: Sequence[Judged], before: Calibration) -> dict[str, Calibration]:
     """Return a model of each family: the weights are those of all, the bias is its own.
 
-    Of rooms, the model fitted to those ``before`` is moved. A family's bias is off the common one by a normal deviate
-    of `BIAS_STD`, so that few cases change little.
+    The model fitted to other cases ``before`` is moved: evidence that these seldom show keeps its weight. A family's
+    bias is off the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
     """
     if not cases:
         return {}
@@ -244,6 +257,9 @@ def drawn(data: Path | None, rooms: int, count: int) -> Iterator[Judged]:
     things = turns(subjects(data))
     for seed in tqdm(range(FIRST_SEED, FIRST_SEED + count), desc="alone", leave=False, disable=None):
         yield from alone(things[seed % len(things)], seed)
+    if data is not None:
+        for seed in tqdm(range(min(count, company.FIRST_SEED)), desc="company", leave=False, disable=None):
+            yield from in_company(data, seed)
 
 
 def among_others(things: Sequence[Subject], seed: int) -> tuple[Subject, Tensor, Tensor | None]:

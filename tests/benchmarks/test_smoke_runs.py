@@ -22,6 +22,7 @@ RUNS = [
         "--smoke --only presence",
         r"PresenceModel\(bias=\S+, weights=\(.+\)\)",
     ),
+    ("company", "--smoke", r"beside +1 clouds: right .*touching +1 .*all +2 .*sure and wrong.*sure of what is right"),
     ("depth_frames", "--smoke", r"cut: left out .*whole: left out.*clouds: 1 cases.*landmarks, both.*track, .*track, "),
     ("depth_pairs", "--smoke", r"made up: 1 pairs, overlap 0\.[5-9].*whole .*moved .*true masks +registered"),
     ("depth_pictures", "--smoke", r"reprojection.*farthest from its pixel, px \(<= 0.5\) +(0\.[0-4]|\d\S*e-).*normals"),
@@ -67,6 +68,7 @@ RUNS = [
 # Script, arguments, a function of the script that finds nothing, and what is printed.
 SKIPPED = [
     ("base_calibration", "--data {folder}", None, "skipped: no xarm7/truth.json in --data"),
+    ("company", "", None, "skipped: needs --data with library"),
     ("gltf_sizes", "", "robots_folder", "no robots"),
     ("pose_initializer", "--device cuda --smoke", "torch.cuda.is_available", "no CUDA device"),
     ("rig_hand", "", None, "skipped: webxr_hand_right.glb"),

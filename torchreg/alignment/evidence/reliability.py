@@ -53,7 +53,7 @@ class Evidence:
         clusters: root of the data in dense clusters off the surface, as a share of those on it.
         off: share of the data that are not on the surface.
         free_space: root of the data that points in free space stand for, as a share of the data.
-        unseen: see `unseen_share`; zero where pictures tell what is there.
+        unseen: root of the `unseen_share`; zero where pictures tell what is there.
         unknown: probability that the data do not determine the ends of the limbs.
         rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
         open_rim: square of `open_rims`; zero for clouds.
@@ -224,7 +224,8 @@ def judge(
         residuals = replace(residuals, contradicted=picture.contradicted)
         loose = loose | (picture.misplaced > CALIBRATION.doubtful)
     else:
-        evidence = replace(evidence, unseen=unseen_share(problem, pose, residuals.distance, residuals.jacobian))
+        unseen = unseen_share(problem, pose, residuals.distance, residuals.jacobian)
+        evidence = replace(evidence, unseen=unseen.sqrt())
     around, calibration = curvature(problem, pose, residuals), PICTURE_CALIBRATION if in_picture else CALIBRATION
     converged, shape = around.converged, problem.skin.shape
     if error is not None:
