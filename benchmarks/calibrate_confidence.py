@@ -25,7 +25,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -57,6 +57,8 @@ FOLDS, MISPLACED, ABOUT, BIAS_STD = 5, 0.1, 0.15, 1.0
 ROOM_FAMILIES = {"hand": "room with a hand", "held": "room with a hand", "arm": "room with a robot"}
 LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed to doubt it
 FAR, CUT_OFF = 0.4, 0.7  # of the size, between which poses tell nothing; of the data, at most
+# Of poses that explain as much one is right, which shapes without symmetry do not teach.
+RIVALS = [[item.name for item in fields(reliability.Evidence)].index(name) for name in ("rival", "rival_share")]
 FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
 
 
@@ -193,19 +195,19 @@ def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
     """
     told = [case for case in cases if not case.in_room or case.told[2] is not None]
     rooms = by_family([case for case in told if case.in_room], reliability.PICTURE_CALIBRATION)
-    return rooms | by_family([case for case in told if not case.in_room], reliability.CALIBRATION)
+    return rooms | by_family([case for case in told if not case.in_room], reliability.CALIBRATION, RIVALS)
 
 
-def by_family(cases: Sequence[Judged], before: Calibration) -> dict[str, Calibration]:
+def by_family(cases: Sequence[Judged], before: Calibration, held: Sequence[int] = ()) -> dict[str, Calibration]:
     """Return a model of each family: the weights are those of all, the bias is its own.
 
-    The model fitted to other cases ``before`` is moved: evidence that these seldom show keeps its weight. A family's
-    bias is off the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
+    The model fitted to other cases ``before`` is moved, except for weights that are ``held``. A family's bias is off
+    the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
     """
     if not cases:
         return {}
     table, right = torch.stack([case.evidence for case in cases if case.evidence is not None]).double(), rights(cases)
-    common, found = fit_logistic(table, right, before=before), {}
+    common, found = fit_logistic(table, right, before=before, held=held), {}
     for family in dict.fromkeys(case.family for case in cases):
         chosen = torch.tensor([case.family == family for case in cases])
         offsets = torch.linspace(-4, 4, 161, dtype=torch.float64).unsqueeze(-1)

@@ -104,6 +104,7 @@ def test_each_family_has_a_bias_of_its_own_and_each_case_is_judged_by_models_of_
     bench, generator, cases = load("calibrate_confidence"), torch.Generator().manual_seed(0), []
     for name in ("CALIBRATION", "PICTURE_CALIBRATION"):
         monkeypatch.setattr(bench.reliability, name, bench.Calibration(bias=0.0, weights=(2.0, 2.0)))
+    monkeypatch.setattr(bench, "RIVALS", [])
     truths = {"hand": 2.0, "rig": 0.5, "room with a hand": 1.0}
     for seed in range(3000):
         family, evidence = list(truths)[seed % 3], torch.rand(2, generator=generator)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -38,7 +39,11 @@ _FIT = _Fit()
 
 
 def fit_logistic(
-    evidence: Tensor, right: Tensor, weights: Tensor | None = None, before: Logistic | None = None
+    evidence: Tensor,
+    right: Tensor,
+    weights: Tensor | None = None,
+    before: Logistic | None = None,
+    held: Sequence[int] = (),
 ) -> Logistic:
     """Return the logistic model of highest likelihood with weights of at least zero, and a ridge or a prior.
 
@@ -47,6 +52,7 @@ def fit_logistic(
         right: (N,) bool.
         weights: (N,) of the cases; all alike by default.
         before: the model fitted to other cases, the mean of the prior; few cases move it little.
+        held: numbers of the evidence whose weights stay those of the model before.
 
     References: Platt 1999.
     """
@@ -56,18 +62,24 @@ def fit_logistic(
     free = torch.full((table.shape[1],), _FIT.start, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.LBFGS([free], max_iter=_FIT.steps, line_search_fn="strong_wolfe")
 
+    known, is_held = torch.zeros_like(free), torch.zeros_like(free, dtype=torch.bool)
+    if before is not None:
+        known, is_held[[1 + number for number in held]] = known.new_tensor([before.bias, *before.weights]), True
+
+    def model() -> Tensor:
+        return torch.where(is_held, known, torch.cat([free[:1], torch.nn.functional.softplus(free[1:])]))
+
     def loss() -> Tensor:
         optimizer.zero_grad()
-        kept = torch.cat([free[:1], torch.nn.functional.softplus(free[1:])])
+        kept = model()
         losses = torch.nn.functional.binary_cross_entropy_with_logits(table @ kept, right.double(), reduction="none")
         penalty = _FIT.ridge * kept[1:].square().mean()
         if before is not None:
-            moved = (kept - kept.new_tensor([before.bias, *before.weights])) / _FIT.moved
-            penalty = 0.5 * moved.square().sum() / len(evidence)
+            penalty = 0.5 * ((kept - known) / _FIT.moved).square().sum() / len(evidence)
         value = losses @ shares + penalty
         value.backward()
         return value
 
     optimizer.step(loss)
-    bias, *kept = torch.cat([free[:1], torch.nn.functional.softplus(free[1:])]).detach().tolist()
+    bias, *kept = model().detach().tolist()
     return Logistic(round(bias, 2), tuple(round(weight, 2) for weight in kept))
