@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends
+from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import hardly_gains
 from torchreg.alignment.evidence.reliability import Evidence, weigh
 from torchreg.alignment.fit.annealed_em import SigmaSchedule, anneal, narrowing
@@ -299,6 +300,7 @@ class FrameFitter:
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
             intruding=fit.intruding,
         )  # fmt: skip
+        evidence = replace(evidence, unseen=unseen_share(problem, pose, fit.distance, fit.jacobian).sqrt())
         if fit.person is not None:
             error = fit.person.error
             return replace(evidence, unknown=error.unknown(self.size)), bool(error.converged)

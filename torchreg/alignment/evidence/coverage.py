@@ -25,7 +25,7 @@ class _Rays:
 _RAYS = _Rays()
 
 
-def visible_points(problem: AlignProblem, pose: Tensor, toward: Tensor) -> Tensor:
+def visible_skin(problem: AlignProblem, pose: Tensor, toward: Tensor) -> Tensor:
     """Return which points (B, N) of the skin in poses (B, num_dofs) a camera in directions (B, N or 1, 3) would see."""
     posed = problem.skin(pose)
     steps = problem.size * _RAYS.nearest * 2.0 ** torch.arange(_RAYS.count).to(posed)
@@ -50,7 +50,7 @@ def unseen_share(
     near = (distance.abs() < INLIER_SHARE * problem.size) & problem.valid
     if toward is None:
         toward = normalize((_normals(jacobian) * near.unsqueeze(-1)).sum(1, keepdim=True), dim=-1)
-    visible = visible_points(problem, pose, toward)
+    visible = visible_skin(problem, pose, toward)
     stride = -(-problem.data.shape[1] // _RAYS.num_data)
     apart = _nearest(problem.skin(pose), problem.data[:, ::stride], near[:, ::stride])
     bare = visible & (apart > 2 * INLIER_SHARE * problem.size)

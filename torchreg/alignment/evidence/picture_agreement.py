@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.confidence import limb_points
-from torchreg.alignment.evidence.coverage import shape_normals, visible_points
+from torchreg.alignment.evidence.coverage import shape_normals, visible_skin
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
@@ -183,7 +183,7 @@ class _Surface:
         """Return what a picture shows where the surface of a pose (1, num_dofs) would be."""
         posed = problem.skin(pose)[0]
         toward = torch.nn.functional.normalize(frame.camera.position.to(posed) - posed, dim=-1)
-        visible = visible_points(problem, pose, toward[None])[0]
+        visible = visible_skin(problem, pose, toward[None])[0]
         pixels, depth = frame.camera.project(posed)
         column, row = pixels.nan_to_num(-1).round().long().unbind(-1)
         height, width = frame.depth.shape
