@@ -17,7 +17,7 @@ from torchreg.alignment.evidence.curvature import correlated_count, neighbor_cor
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.datasets.hand import surface_skin
 from torchreg.geometry.sampling import farthest_points
-from torchreg.geometry.visibility import visible_skin
+from torchreg.geometry.visibility import visible_points
 
 FREE = tr.AlignConfig(search="never", prior_std=None)
 
@@ -65,7 +65,7 @@ def test_surface_without_data_counts_as_unseen_where_a_camera_would_see_it(plain
     skin, pose = surface_skin(plain_hand), plain_hand.rest_pose()
     pose[:6] = torch.tensor([0.0, 0.0, 0.8, 0.4, 2.0, -0.3])
     mesh = tr.TriangleMesh(skin(pose), skin.faces)
-    seen = visible_skin(mesh, mesh.vertices, torch.zeros(3))
+    seen = visible_points(mesh, mesh.vertices, torch.zeros(3))
     data = mesh.vertices[seen]
     above = data[:, 0] > data[:, 0].median()
     clouds = torch.stack([data, torch.where(above.unsqueeze(-1), data, torch.nan)])
