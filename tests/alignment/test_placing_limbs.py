@@ -1,12 +1,15 @@
 """Placing limbs on data, the base known: fingers, arms on a spine, jaws, slides and balls are found; limits hold."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 import torchreg as tr
-from tests.alignment.made import TIPS, hinge, joint, off, shape_of, solid
+from tests.alignment.made import TIPS, hinge, joint, off, problem_of, shape_of, solid
+from torchreg.alignment.search.limb_search import trunk_turns
+from torchreg.geometry.rotation import so3_log
 
 ONE = tr.FindPoseConfig(num_candidates=1, num_placed=1, num_searched=1, search_rounds=1)
 
@@ -137,3 +140,35 @@ def test_joints_are_tried_over_their_range_or_one_turn(limits):
     found = placed(shape, skin(truths), start, model_points=skin)
     torch.testing.assert_close(found[:, 6].sin(), truths[:, 6].sin(), rtol=0, atol=0.02)
     torch.testing.assert_close(found[:, 6].cos(), truths[:, 6].cos(), rtol=0, atol=0.02)
+
+
+def problem_on(shape, pose):
+    """A problem of one point, of which the turns of a trunk do not depend."""
+    return problem_of(tr.sample_skin(shape, 20), torch.zeros(len(pose), 1, 3), pose)
+
+
+def test_a_trunk_turns_on_the_limb_that_it_hangs_on_and_all_else_stays():
+    shape = shape_of(FREE_ARM, [block(0.1, 0.08, 0.03), rod(0.2), rod(0.2), rod(0.2)])
+    pose = shape.rest_pose().repeat(2, 1)
+    pose[:, :6] = torch.tensor([[0.3, -0.2, 0.1, 0.4, -1.0, 0.7], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    pose[:, 6:] = torch.tensor([[0.3, -0.2, 0.5], [1.0, 0.2, 0.0]])
+    turned = trunk_turns(problem_on(shape, pose), pose)
+    assert turned.shape[1] > 8
+    before, after = shape.part_transforms(pose).unsqueeze(1), shape.part_transforms(turned)
+    torch.testing.assert_close(after[:, :, 1:], before[:, :, 1:].expand_as(after[:, :, 1:]), rtol=0, atol=1e-5)
+    # The trunk goes round the hinge as far as the joint turns back.
+    turn = so3_log((before[:, :, 0, :3, :3].mT @ after[:, :, 0, :3, :3]).flatten(0, 1)).norm(dim=-1)
+    expected = (turned[..., 6] - pose[:, None, 6]).abs().flatten()
+    torch.testing.assert_close(turn, torch.minimum(expected, 2 * math.pi - expected), rtol=0, atol=1e-3)
+    torch.testing.assert_close(turned[..., 7:], pose[:, None, 7:].expand_as(turned[..., 7:]), rtol=0, atol=0)
+    torch.testing.assert_close(trunk_turns(problem_on(shape, pose[1:]), pose[1:]), turned[1:], rtol=0, atol=1e-6)
+
+
+def test_a_trunk_with_several_limbs_or_known_does_not_turn(plain_hand):
+    shape = shape_of(FREE_ARM, [block(0.1, 0.08, 0.03), rod(0.2), rod(0.2), rod(0.2)])
+    pose = shape.rest_pose()[None]
+    told = torch.zeros_like(pose)
+    told[:, 2] = 1.0
+    assert trunk_turns(replace(problem_on(shape, pose), prior_precision=told), pose).shape[1] == 0
+    rest = plain_hand.rest_pose()[None]
+    assert trunk_turns(problem_on(plain_hand, rest), rest).shape[1] == 0

@@ -19,11 +19,13 @@ from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, alignment
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import UNITS, Task, check_clouds, warn_about_degenerate, warn_about_units
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.search.multi_start import mean_distances
+from torchreg.alignment.search.limb_search import trunk_turns
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, mean_distances, score_candidates
 from torchreg.alignment.search.pose_search import explore, needs_search
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.budget import BUDGET
 from torchreg.result import Status, normal_copy
+from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.e_step import expectation
@@ -35,6 +37,7 @@ class RowNumbers:
 
     min_share: float = 0.02  # inliers, as a share of the data, with fewer of which a pose means nothing
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
+    turned: int = 8  # poses with the trunk turned, the best of its samples, that are fitted
 
 
 ROWS = RowNumbers()
@@ -138,13 +141,34 @@ class PoseRows:
         if config.search == "auto":
             index = needs_search(self.problem, self.start, found.found.pose).nonzero()[:, 0]
         if len(index) == 0:
-            return found
+            return found._trunk_turned()
         rows, generator = found.rows(index), torch.Generator().manual_seed(config.seed)
         explored = explore(
             rows.problem, rows.start, rows.found.pose, candidates=config.num_candidates, rounds=config.search_rounds,
             generator=generator,
         )  # fmt: skip
-        return found._joined(index, rows._refitted(explored, on_step=rows.record))
+        return found._joined(index, rows._refitted(explored, on_step=rows.record))._trunk_turned()
+
+    def _trunk_turned(self) -> PoseRows:
+        """Return the rows of a search with the trunk turned on the limb that it hangs on, where that is better.
+
+        A base that is nearly square, or of which little is seen, stays in the minimum that it was registered in: such
+        minima are rivals, unless the trunk looks alike in them.
+        """
+        problem = self.problem
+        turns = trunk_turns(problem, self.found.pose)
+        if self.lead is None or turns.shape[1] == 0 or self.task.config.surface_steps == 0:
+            return self
+        ranked = Candidates.ranked(problem, turns, score_candidates(problem, turns, INLIER_SHARE))
+        some = torch.cat([self.found.pose.unsqueeze(1), ranked.poses[:, : ROWS.turned]], dim=1)
+        found = Candidates.fitted(problem, some)
+        trunk = torch.isin(problem.skin.weights.argmax(-1), torch.tensor(find_limbs(problem.skin.shape)[1]))
+        points = problem.skin(found.poses)[:, :, trunk]
+        off = problem.surface.distance(points.flatten(1, 2), found.poses[:, 0]).view_as(points[..., 0])
+        differs = off.square().mean(-1).sqrt() > SEARCH_BUDGET.duplicate * problem.size
+        lead = torch.where(differs, found.costs, torch.inf).amin(1) - found.costs[:, 0]
+        rows = self._refitted(found.poses[:, 0], on_step=None)
+        return replace(rows, lead=torch.minimum(self.lead, lead))
 
     def finished(self) -> PoseRows:
         """Return the rows fitted without what a crop cuts off, and to the end where another step would still gain."""

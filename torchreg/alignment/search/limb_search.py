@@ -15,7 +15,7 @@ from torch import Tensor
 from torchreg.alignment.fit.problem import BALL_AXES, PRIOR_SHARE, AlignProblem
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, distinct_first, rows_in_memory, take_rows
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
-from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.limbs import Body, Limb, find_limbs
 from torchreg.shapes.pose_algebra import BASE_DOFS
@@ -98,6 +98,29 @@ def joint_samples(shape: Articulation, body: Body) -> Tensor:
         )
         shares = torch.stack(grids, dim=-1).reshape(-1, len(dofs))
     return lower + (upper - lower) * shares.to(lower)
+
+
+def trunk_turns(problem: AlignProblem, poses: Tensor) -> Tensor:
+    """Return poses (B, G, num_dofs) of which the trunk alone differs, by samples of the joints that it hangs on.
+
+    All else stays where poses (B, num_dofs) have it. None where several limbs hold the trunk, or it is known.
+    """
+    shape, (limbs, trunk) = problem.skin.shape, find_limbs(problem.skin.shape)
+    first = [limb.bodies[0] for limb in limbs if limb.level == 0]
+    samples = joint_samples(shape, first[0]) if len(first) == 1 and trunk else shape.rest.new_zeros(0, 0)
+    dofs = [*range(BASE_DOFS), *(first[0].dofs if len(first) == 1 else ())]
+    told = problem.lower == problem.upper
+    if problem.prior_precision is not None:
+        told = told | (problem.prior_precision > 0)
+    if len(samples) == 0 or bool(told[..., dofs].any()):
+        return poses.new_zeros(len(poses), 0, poses.shape[-1])
+    turned = poses.unsqueeze(1).repeat(1, len(samples), 1)
+    turned[..., dofs[BASE_DOFS:]] = samples
+    limb, moved = (shape.part_transforms(each)[..., first[0].parts[0], :, :] for each in (poses.unsqueeze(1), turned))
+    base = limb @ invert_rigid(moved) @ rigid_matrix(so3_exp(poses[:, 3:BASE_DOFS]), poses[:, :3]).unsqueeze(1)
+    turned[..., :3] = base[..., :3, 3]
+    turned[..., 3:BASE_DOFS] = so3_log(base[..., :3, :3].flatten(0, 1)).unflatten(0, base.shape[:2])
+    return turned
 
 
 class LimbSearch:
