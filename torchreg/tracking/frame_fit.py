@@ -135,11 +135,12 @@ class FrameFitter:
         config: see `TrackConfig`.
         skin: the model points; sampled by default.
         person: whose coefficients are fitted too.
+        clusters: of a shape of about the same proportions, whose limbs reach as far in its own size.
     """
 
     def __init__(
         self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None,
-        person: PersonFilter | None = None,
+        person: PersonFilter | None = None, clusters: UnexplainedClusters | None = None,
     ) -> None:  # fmt: skip
         self.shape, self.config, self.person = shape, config, person
         # About half of the shape's points are seen at a time.
@@ -155,7 +156,9 @@ class FrameFitter:
         )  # fmt: skip
         self.size = self._template.size
         self.inlier_distance = config.inlier_distance or INLIER_SHARE * self.size
-        self.clusters = UnexplainedClusters(self.skin, self.limbs, self.size)
+        self.clusters = (
+            clusters.scaled(self.size) if clusters else UnexplainedClusters(self.skin, self.limbs, self.size)
+        )
 
     def predict(self, state: TrackState, elapsed: float) -> Tensor:
         """Return the pose (num_dofs,) expected after some intervals."""

@@ -111,6 +111,7 @@ class Tracker:
             model_points = check_skin(shape, model_points)
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
+            self._mean_clusters = self._fitter.clusters
             self._recover = Recovery(
                 self._fitter, StartSource.of(shape, initializer=initializer, upright=self.config.upright)
             )  # fmt: skip
@@ -305,7 +306,7 @@ class Tracker:
             return
         self.shape, self._followed = self._person.rig.with_coefficients(coefficients), coefficients
         with torch.no_grad():
-            self._fitter = FrameFitter(self.shape, self.config, None, self._person)
+            self._fitter = FrameFitter(self.shape, self.config, None, self._person, self._mean_clusters)
             self._recover = Recovery(self._fitter, StartSource.of(self.shape, upright=self.config.upright))
 
     def _follow_closer(self) -> None:
