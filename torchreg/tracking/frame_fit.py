@@ -47,7 +47,7 @@ from torchreg.tracking.config import TrackConfig
 from torchreg.tracking.evidence import UnexplainedClusters, share_at_limits
 from torchreg.tracking.frame import MIN_DATA, WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.motion_model import FILTER, moves_fast, predict_pose, prediction_std, uncertainty_growth
-from torchreg.tracking.person_filter import KnownPerson, Motion, PersonFilter, PersonFit
+from torchreg.tracking.person_filter import KnownPerson, Motion, OrientedScan, PersonFilter, PersonFit
 from torchreg.tracking.results import TrackState
 
 
@@ -196,7 +196,8 @@ class FrameFitter:
             problem = replace(informed, lower=informed.lower[0], upper=informed.upper[0], prior=prior)
         viewpoint = None if frame.picture is None else frame.picture.camera.position - origin
         return FrameView(
-            problem=problem, origin=origin, rows=rows, in_reach=in_reach, elapsed=frame.elapsed, viewpoint=viewpoint
+            problem=problem, origin=origin, rows=rows, in_reach=in_reach, elapsed=frame.elapsed, viewpoint=viewpoint,
+            scan=None if self.person is None else OrientedScan.of(data, viewpoint),
         )  # fmt: skip
 
     @cached_property
@@ -251,8 +252,8 @@ class FrameFitter:
             fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=widths)
             pose = fitted.pose
         known = state.known_person
-        if self.person is not None and known is not None:
-            person = self._fitted_person(self.person, known, view, state, acquired, pose[0])
+        if self.person is not None and view.scan is not None and known is not None:
+            person = self._fitted_person(self.person, known, view, view.scan, state, acquired, pose[0])
             pose = person.pose.unsqueeze(0)
             fitted = SurfaceResult(
                 pose, *problem.surface.distance_jacobian(problem.data, pose), person.last_step.unsqueeze(0)
@@ -263,16 +264,17 @@ class FrameFitter:
         return replace(self._with_evidence(view, state, acquired, fitted, residual[0]), person=person)
 
     def _fitted_person(
-        self, person: PersonFilter, known: KnownPerson, view: FrameView, state: TrackState, acquired: str, pose: Tensor
-    ) -> PersonFit:
+        self, person: PersonFilter, known: KnownPerson, view: FrameView, scan: OrientedScan, state: TrackState,
+        acquired: str, pose: Tensor,
+    ) -> PersonFit:  # fmt: skip
         """Return the fit of pose and coefficients from a pose (num_dofs,)."""
-        data, motion = view.problem.data[0], None
+        motion = None
         if not state.tracked and acquired == "tracked":
-            return person.joined(known, data, pose, view.viewpoint)
+            return person.joined(known, scan, pose)
         if state.lost == 0 and acquired != "found":
             prior = self._prediction_prior(view.problem, state, view.elapsed)
             motion = Motion(view.problem.prior.mean[0], prior.precision.rsqrt())
-        return person.fit(known, data, pose, motion, view.viewpoint)
+        return person.fit(known, scan, pose, motion)
 
     def covariance(self, fit: FrameFit) -> tuple[Tensor, Tensor]:
         """Return the covariance (num_dofs, num_dofs) of a fit and its observed share (num_dofs,).
@@ -287,7 +289,7 @@ class FrameFitter:
         if fit.person is None:
             covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
         else:
-            covariance = fit.person.known.covariance[: len(precision), : len(precision)]
+            covariance = fit.person.known.total[: len(precision), : len(precision)]
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
     def judged(self, fit: FrameFit, covariance: Tensor) -> tuple[Evidence, bool]:

@@ -65,7 +65,7 @@ class FittedShape:
 
     `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
     state is worse in a search; `shared` (T,) is the deviation of errors that neighbors share, metres. `rig` has
-    those of clothes as its last coefficients, where there may be any, which lie off the skin by `clothing` (V,), metres.
+    those of clothes as its last coefficients, where there may be any, lying off the skin by `clothing` (V,), metres.
     """
 
     poses: Tensor
