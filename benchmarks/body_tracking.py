@@ -11,7 +11,9 @@ points are of all sides. The error is the distance of every vertex, hidden ones 
     python benchmarks/body_tracking.py --data DIR              # captured people: DIR/samba.npz, DIR/captured_people
 
 Of samba the vertices are followed through all frames: each is bound in the first frame to the nearest place of the body
-found there. Of DIR/captured_people, whose meshes have no vertices in common, distances of the surfaces are told.
+found there. Of DIR/captured_people, whose meshes have no vertices in common, distances of the surfaces are told. Of
+made-up people it is also told how many joints of all frames lie within their 95 % ellipsoids, and how many coefficients
+within their 95 % intervals.
 """
 
 from __future__ import annotations
@@ -39,6 +41,8 @@ from torchreg.geometry.mesh import interpolate, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import aim, rasterize
+from torchreg.shapes.shaped import ShapedTree
+from torchreg.tracking.person_filter import KnownPerson
 
 FPS, COUNT, NOISE, PIXELS, CAMERA = 30.0, 2000, 0.003, 400, 4.0
 # Samples of a body to which captured points are bound.
@@ -46,18 +50,22 @@ BOUND = 20000
 PERIODS, WALK, TURN = (1.0, 4.0), 0.3, math.radians(20)
 # The last ten frames may not be worse than the first ten by more than this share; frames per CPU second.
 DRIFT_BAR, RATE_BAR, ENDS = 1.05, 2.0, 10
+# 95 % of a normal distribution in three dimensions, squared, and in one; a step of differences.
+ELLIPSOID, INTERVAL, DIFFERENCE = 7.815, 1.96, 1e-2
 # The tracker finds the person in the first frame.
 STARTED = 1
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A person in T frames: data (M, 3), true vertices (T, V, 3) where they are known, and meshes."""
+    """A person in T frames: data (M, 3), meshes, and the true joints (T, P, 3) and phenotypes (K,) of a made-up one."""
 
     data: Sequence[Tensor]
     meshes: Sequence[tr.TriangleMesh]
     start: Tensor | None
     up: tuple[float, float, float]
+    joints: Sequence[Tensor] = ()
+    phenotypes: Tensor | None = None
 
 
 def made_up(shape: tr.ArticulatedShape, seed: int, frames: int, *, whole: bool) -> Clip:
@@ -72,7 +80,8 @@ def made_up(shape: tr.ArticulatedShape, seed: int, frames: int, *, whole: bool) 
     pace = 1 / (FPS * (PERIODS[0] + (PERIODS[1] - PERIODS[0]) * share))
     angles[0], up = 0, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     azimuth = 2 * math.pi * float(torch.rand((), generator=generator))
-    camera, meshes, data = None, [], []
+    camera, meshes, data, joints = None, [], [], []
+    parts = [model.bone_labels.index(name) for name in shape.part_names]
     for number in range(frames):
         deltas, seconds = person.deltas.clone(), number / FPS
         swing = (2 * math.pi * (pace * number + phase)).sin() - (2 * math.pi * phase).sin()
@@ -80,13 +89,16 @@ def made_up(shape: tr.ArticulatedShape, seed: int, frames: int, *, whole: bool) 
         deltas[0, :3, :3] = so3_exp(seconds * TURN * up) @ deltas[0, :3, :3]
         deltas[0, 1, 3] += WALK * seconds
         with torch.no_grad():
-            vertices = model(pose_parameters=deltas[None], phenotype_kwargs=person.phenotypes[None])["vertices"][0]
+            posed = model(pose_parameters=deltas[None], phenotype_kwargs=person.phenotypes[None])
+        vertices = posed["vertices"][0]
+        joints.append(posed["bone_poses"][0, parts, :3, 3])
         meshes.append(tr.TriangleMesh(vertices, faces))
         if camera is None:
             away = torch.tensor([math.cos(azimuth), math.sin(azimuth), 0.1], dtype=torch.float64)
             camera = vertices.mean(0) + CAMERA * away
         data.append((whole_scan if whole else partial(seen_from, camera))(meshes[-1], NOISE, COUNT, generator))
-    return Clip(data, meshes, start_pose(model, shape, person), (0.0, 0.0, 1.0))
+    start = start_pose(model, shape, person)
+    return Clip(data, meshes, start, (0.0, 0.0, 1.0), joints, person.phenotypes)
 
 
 def seen_from(camera: Tensor, mesh: tr.TriangleMesh, noise: float, count: int, generator: torch.Generator) -> Tensor:
@@ -117,18 +129,22 @@ def captured(path: Path, frames: int) -> Clip:
 
 @dataclass(frozen=True)
 class Followed:
-    """What a tracker made of a clip: bodies (T, V, 3), statuses and confidences of frames, CPU seconds of each."""
+    """What a tracker made of a clip: bodies (T, V, 3), statuses and confidences of frames, CPU seconds of each.
+
+    `covered` are the shares of joints and of coefficients within their ellipsoids, (T, 2).
+    """
 
     bodies: list[Tensor]
     statuses: list[tr.Status]
     confidences: list[float]
     seconds: list[float]
+    covered: list[tuple[float, float]]
 
 
 def follow(shape: tr.ArticulatedShape, clip: Clip, *, smooth: bool = False) -> Followed:
     """Return what a tracker makes of a clip, and a second pass where that is wanted."""
     tracker = tr.Tracker(shape, clip.start, fit_shape=True, config=tr.TrackConfig(upright=clip.up))
-    bodies, statuses, confidences, ticks = [], [], [], [time.process_time()]
+    bodies, statuses, confidences, covered, ticks = [], [], [], [], [time.process_time()]
     data = [points.float() for points in clip.data]
 
     def note(points: Tensor, result: tr.FrameResult) -> None:
@@ -136,15 +152,36 @@ def follow(shape: tr.ArticulatedShape, clip: Clip, *, smooth: bool = False) -> F
         bodies.append(shape.vertices(result.pose, result.coefficients).double())
         statuses.append(result.status)
         confidences.append(float(result.confidence))
+        known = tracker.state.known_person
+        if clip.phenotypes is not None and known is not None and len(known.covariance) > len(known.coefficients):
+            covered.append(coverage(shape, result.pose, known, clip.joints[len(bodies) - 1], clip.phenotypes))
 
     track = tracker.run(data, note)
     seconds = torch.tensor(ticks, dtype=torch.float64).diff().tolist()
     if not smooth:
-        return Followed(bodies, statuses, confidences, seconds)
+        return Followed(bodies, statuses, confidences, seconds, covered)
     again = tr.smooth_track(track, data)
     bodies = [shape.vertices(pose, track.coefficients).double() for pose in again.poses]
     spent = (time.process_time() - ticks[-1]) / len(bodies)
-    return Followed(bodies, statuses, confidences, [value + spent for value in seconds])
+    return Followed(bodies, statuses, confidences, [value + spent for value in seconds], covered)
+
+
+def coverage(
+    shape: tr.ArticulatedShape, pose: Tensor, known: KnownPerson, joints: Tensor, phenotypes: Tensor
+) -> tuple[float, float]:
+    """Return the shares of joints (P, 3) and coefficients (K,) within the 95 % ellipsoids about a pose (D,) found."""
+    space, count = shape.coefficient_space(), shape.num_dofs + len(phenotypes)
+    tree, covariance = ShapedTree(shape, space), known.total[:count, :count].double()
+    state = torch.cat([pose, known.coefficients.to(pose)])[:count]
+    ends = torch.cat([torch.eye(count), -torch.eye(count), torch.zeros(1, count)]) * DIFFERENCE
+    with torch.no_grad():
+        placed = tree.posed(tree.retract(state, ends), tree.space.restricted(torch.zeros(1, dtype=torch.int64)))
+    places = placed.frames[:, shape.part_index, :3, 3].double()
+    moves = ((places[:count] - places[count:-1]) / (2 * DIFFERENCE)).permute(1, 2, 0)
+    error = (places[-1] - joints).unsqueeze(-1)
+    squares = (error.mT @ torch.linalg.solve(moves @ covariance @ moves.mT, error)).flatten()
+    off = (state[-len(phenotypes) :] - phenotypes).abs() / covariance.diagonal()[-len(phenotypes) :].sqrt()
+    return float((squares < ELLIPSOID).double().mean()), float((off < INTERVAL).double().mean())
 
 
 def vertex_errors(found: Followed, clip: Clip) -> Tensor:
@@ -181,6 +218,9 @@ def report(name: str, errors: Tensor, found: Followed) -> bool:
     sure = sum(status is tr.Status.CONVERGED for status in found.statuses)
     alike = sum((status is tr.Status.CONVERGED) == (value >= 0.5)
                 for status, value in zip(found.statuses, found.confidences, strict=True))  # fmt: skip
+    if found.covered:
+        joints, coefficients = torch.tensor(found.covered).mean(0).tolist()
+        print(f"{name}: 95 % ellipsoids cover {joints:.0%} of the joints, {coefficients:.0%} of the coefficients")
     print(f"{name}: first {ends} frames {first:.1f} mm, last {ends} {last:.1f} mm, mean {float(errors.mean()):.1f}, "
           f"worst {float(errors.max()):.1f}; {rate:.2f} frames per CPU s after the first ({found.seconds[0]:.1f} s); "
           f"{sure} of {len(errors)} converged; status and confidence agree in {alike} "

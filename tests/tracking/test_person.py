@@ -8,6 +8,8 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import person_cloud
+from torchreg.geometry.mesh import sample_surface
+from torchreg.tracking.person_filter import KnownPerson, OrientedScan, PersonFilter
 
 TRUTH = torch.tensor([0.7, -0.6, 0.9])
 
@@ -25,6 +27,11 @@ def scans(shape, poses, coefficients):
     """Return what a camera at -y sees of a person, with noise and 5 % outliers."""
     generator = torch.Generator().manual_seed(2)
     return [person_cloud(shape, pose, coefficients, generator, 400, noise=0.003) for pose in poses]
+
+
+def coefficients_of(covariance):
+    """Return the block of the coefficients of a covariance of pose and coefficients."""
+    return covariance[-len(TRUTH) :, -len(TRUTH) :]
 
 
 def start_near(poses):
@@ -49,10 +56,35 @@ def test_the_error_of_the_coefficients_falls_with_the_frames(tracked):
     assert all(result.status is tr.Status.CONVERGED for result in tracked.results)
     assert float(errors[-1]) < 0.7 * float(errors[0])
     assert float(errors[-1]) < 0.08
-    # Information adds up; with the frames it grows in proportion.
-    assert bool((deviations.diff(dim=0) < 0).all())
-    assert bool((deviations[-1] < 0.7 * deviations[0]).all())
+    # Information adds up; with the frames it grows in proportion. Errors of the model are the same in all frames.
+    noise = torch.stack([coefficients_of(state.person_covariance).diagonal().sqrt() for state in tracked.states])
+    assert bool((noise.diff(dim=0) < 0).all())
+    assert bool((noise[-1] < 0.7 * noise[0]).all())
+    assert bool((deviations >= noise).all())
+    assert float(deviations.diff(dim=0)[-1].abs().max()) < 0.05 * float(deviations[-1].max())
     assert bool(((tracked.results[-1].coefficients - TRUTH).abs() < 4 * deviations[-1] + 0.02).all())
+
+
+def test_a_part_off_its_place_moves_the_estimate_as_its_sensitivity_says(person):
+    pose = motion(person, 1)[0]
+    body, generator = PersonFilter(person, True), torch.Generator().manual_seed(3)
+    mesh = tr.TriangleMesh(person.vertices(pose, TRUTH), person.surface.faces)
+    points, face, _ = sample_surface(mesh, 1500, generator=generator)
+    points += 0.003 * torch.randn(points.shape, generator=generator)
+    outward, part = mesh.face_normals()[face], person.surface.weights.argmax(-1)[mesh.faces[face, 0]]
+    known = KnownPerson(TRUTH, 0.04 * torch.eye(3), torch.zeros(3, person.num_parts))
+
+    def fitted(data):
+        found = body.fit(known, OrientedScan(data, outward), pose, None)
+        return found.known.coefficients, found.known.alone.sensitivity
+
+    _, sensitivity = fitted(points)
+    for number in range(person.num_parts):
+        shift = 1e-3 * outward * (part == number).unsqueeze(-1)
+        (more, _), (less, _) = fitted(points + shift), fitted(points - shift)
+        moved, told = (more - less) / 2, sensitivity[:, number]
+        # One deviation is twice that of the residuals, 6 mm.
+        assert float((6 * moved - told).norm()) < 0.2 * float(told.norm())
 
 
 def test_the_rig_that_is_followed_is_that_of_the_person(tracked, person):
@@ -94,7 +126,9 @@ def test_bones_of_any_rig_are_followed(person):
     rig = person.with_coefficients(torch.zeros(3))
     poses = motion(person, 2)
     tracker = tr.Tracker(rig, start_near(poses), fit_shape="bones")
-    results = [tracker.step(cloud) for cloud in scans(person, poses, TRUTH)]
+    results, told = [], []
+    for cloud in scans(person, poses, TRUTH):
+        results.append(tracker.step(cloud))
+        told.append(tracker.state.person_covariance)
     assert len(results[0].coefficients) == 2 + 2 * rig.num_parts
-    spread = [float(result.coefficient_covariance.diagonal().sum()) for result in results]
-    assert spread[1] < spread[0]
+    assert float(coefficients_of(told[1]).diagonal().sum()) < float(coefficients_of(told[0]).diagonal().sum())

@@ -187,8 +187,8 @@ class PoseRows:
         more = left._refitted(left.found.pose, on_step=left.record, if_better=False, steps=steps, widths=())
         return rows._joined(index, more)
 
-    def judged(self, error: SurfaceError | None = None) -> AlignResult:
-        """Return the result, with what speaks against it; ``error`` is that of a person's surface."""
+    def judged(self, error: SurfaceError | None = None, covariance: Tensor | None = None) -> AlignResult:
+        """Return the result, with what speaks against it; error and covariance (1, D, D) are those of a person."""
         problem, pose, config, seen = self.problem, self.found.pose, self.task.config, self.task.seen
         rivals = None if self.rivals is None else _different(self, self.rivals)
         fitted = DataOnShape.of(self, problem.data, problem.valid)
@@ -198,7 +198,9 @@ class PoseRows:
         # What lies off the surface tells nothing of the pose, unless all does.
         told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
         degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=4)
-        judgement = judge(self.uncropped, pose, self.lead, error, seen.frames, rivals, self.task.in_picture)
+        judgement = judge(
+            self.uncropped, pose, self.lead, error, seen.frames, rivals, self.task.in_picture, covariance
+        )  # fmt: skip
         confidence = torch.where(degenerate, 0.0, judgement.confidence)
         converged = self.found.change <= config.pose_atol
         converged = converged | judgement.converged if config.surface_steps or error is not None else converged

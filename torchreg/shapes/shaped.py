@@ -7,8 +7,7 @@ the positions of its frame at rest and in the pose.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +16,13 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import difference, retract
 from torchreg.shapes.shape_space import ShapeSpace
+
+
+class LazyJacobian(Protocol):
+    """Takes an index (M,) of points, and directions (B, M, 3), to derivatives (B, M, D + K) along these or normals."""
+
+    def __call__(self, index: Tensor, direction: Tensor | None = None) -> Tensor:
+        """Return the derivatives."""
 
 
 class _Posed(NamedTuple):
@@ -190,14 +196,17 @@ class ShapedSkin(nn.Module):
         points, normals, jacobian_of = self.lazy_normal_jacobian(state)
         return points, normals, jacobian_of(torch.arange(len(self), device=points.device))
 
-    def lazy_normal_jacobian(self, state: Tensor) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-        """Return points and normals (B, N, 3), and what takes an index (M,) to the derivatives (B, M, D + K)."""
+    def lazy_normal_jacobian(self, state: Tensor) -> tuple[Tensor, Tensor, LazyJacobian]:
+        """Return points and normals (B, N, 3), and what takes an index (M,) to the derivatives (B, M, D + K).
+
+        They are along the normals, or along other directions (B, M, 3) that are given.
+        """
         posed = self.shape.posed(state, self.space)
         points, blend = self._placed(posed)
         normals = self._normals(posed, blend)
 
-        def along(index: Tensor) -> Tensor:
-            normal = normals[..., index, :]
+        def along(index: Tensor, direction: Tensor | None = None) -> Tensor:
+            normal = normals[..., index, :] if direction is None else direction
             linear, angular, by_part = self._motions(posed, index)
             # n . (angular x m) = angular . (m x n), summed over the parts that each degree of freedom moves.
             levers = torch.linalg.cross(by_part, normal.mT.unsqueeze(-3).expand_as(by_part), dim=-2)

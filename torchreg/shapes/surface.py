@@ -64,6 +64,8 @@ class SkinSurface:
         self.skin = skin
         self.first = _first_copies(skin)
         self.reach = _DENSE.rim_spacings * _spacing(skin.points, self.first)
+        self._moves = skin.shape.part_moves()
+        self._subtree = skin.basis[:, 3::4] @ self._moves
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
@@ -72,12 +74,21 @@ class SkinSurface:
 
     def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances (..., N) and their Jacobian (..., N, num_dofs) in tangent coordinates."""
-        rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
-        posed, normals = self.skin.place(rows), self.skin.turn_normals(rows)
-        distance, nearest, normal = self._plane_distance(points, posed, normals)
-        # Contracted with the normals first: the products are smaller than the motions of all points.
-        along = (self.skin.basis[nearest].unsqueeze(-1) * normal.unsqueeze(-2)).flatten(-2)
-        return distance, -(along @ derivative.flatten(-3, -2))
+        shape = self.skin.shape
+        frames = shape.frame_transforms(pose)
+        transforms, (linear, angular) = (
+            frames.index_select(-3, shape.part_index),
+            shape.frame_twists(pose, frames, "tangent"),
+        )
+        rows = stacked_rows(transforms)
+        distance, nearest, normal = self._plane_distance(points, self.skin.place(rows), self.skin.turn_normals(rows))
+        # n . (v + w x p) = n . v + w . (p x n), summed over the parts that each degree of freedom moves.
+        weighted = self.skin.basis[nearest].unflatten(-1, (-1, 4))
+        by_part = transforms[..., :3, :] @ weighted.movedim(-3, -1)
+        levers = torch.linalg.cross(by_part, normal.mT.unsqueeze(-3).expand_as(by_part), dim=-2)
+        turning = (self._moves.unsqueeze(-2) * angular.mT.unsqueeze(-3)).flatten(-3, -2)
+        along = (normal @ linear.mT) * self._subtree[nearest] + levers.flatten(-3, -2).mT @ turning
+        return distance, -(along @ shape.couplings() if shape.kinematics.has_mimics else along)
 
     def _plane_distance(self, points: Tensor, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         nearest = self.first[nearest_neighbor(points, posed)[0]]

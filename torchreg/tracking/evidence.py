@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -48,6 +49,12 @@ class UnexplainedClusters:
     def __init__(self, skin: LinearBlendSkin, limbs: Sequence[Limb], size: float) -> None:
         self.size = size
         self._reach = LimbReach(skin, limbs, SEARCH_BUDGET.same * size)
+
+    def scaled(self, size: float) -> UnexplainedClusters:
+        """Return the same for a shape of another size but about the same proportions."""
+        other = copy.copy(self)
+        other.size, other._reach = size, self._reach.scaled(size / self.size)
+        return other
 
     def find(self, data: Tensor, distance: Tensor, residual: Tensor) -> Tensor:
         """Return the data (K, 3) off the surface that lie as densely as those on it; most outliers are sparse.
@@ -114,6 +121,14 @@ class LimbReach:
         cells = points.new_zeros((index.amax(0) + 2).tolist())
         cells[index.unbind(-1)] = 1.0
         self.cells = torch.nn.functional.max_pool3d(cells[None, None], 3, 1, 1)[0, 0] > 0
+
+    def scaled(self, factor: float) -> LimbReach:
+        """Return the reach of limbs larger by a factor."""
+        other = copy.copy(self)
+        other.cell = factor * self.cell
+        if self.cells is not None:
+            other.low = factor * self.low
+        return other
 
     def __call__(self, points: Tensor, trunk: Tensor) -> Tensor:
         """Return which points (N, 3) a limb may reach, (N,), for a trunk at (4, 4)."""

@@ -17,7 +17,7 @@ from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import stacked_rows
-from torchreg.tracking.person_filter import PersonFit
+from torchreg.tracking.person_filter import OrientedScan, PersonFit
 from torchreg.tracking.results import TrackState
 
 # Fewer data, or fewer inliers, determine no pose.
@@ -82,6 +82,7 @@ class FrameView:
     in_reach: Tensor  # (M,) where a point of the cloud is in reach; the problem may hold a subset of these
     elapsed: float
     viewpoint: Tensor | None  # (3,) of the camera, if one took the frame
+    scan: OrientedScan | None = None  # the data with normals, where coefficients are fitted too
 
     def to_local(self, poses: Tensor) -> Tensor:
         """Return poses (S, num_dofs) of the world in these coordinates and within the limits, (1, S, num_dofs)."""

@@ -48,7 +48,7 @@ from torchreg.tracking.config import TrackConfig
 from torchreg.tracking.evidence import UnexplainedClusters, share_at_limits
 from torchreg.tracking.frame import MIN_DATA, WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
 from torchreg.tracking.motion_model import FILTER, moves_fast, predict_pose, prediction_std, uncertainty_growth
-from torchreg.tracking.person_filter import KnownPerson, Motion, PersonFilter, PersonFit
+from torchreg.tracking.person_filter import KnownPerson, Motion, OrientedScan, PersonFilter, PersonFit
 from torchreg.tracking.results import TrackState
 
 
@@ -136,11 +136,12 @@ class FrameFitter:
         config: see `TrackConfig`.
         skin: the model points; sampled by default.
         person: whose coefficients are fitted too.
+        clusters: of a shape of about the same proportions, whose limbs reach as far in its own size.
     """
 
     def __init__(
         self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None,
-        person: PersonFilter | None = None,
+        person: PersonFilter | None = None, clusters: UnexplainedClusters | None = None,
     ) -> None:  # fmt: skip
         self.shape, self.config, self.person = shape, config, person
         # About half of the shape's points are seen at a time.
@@ -156,7 +157,9 @@ class FrameFitter:
         )  # fmt: skip
         self.size = self._template.size
         self.inlier_distance = config.inlier_distance or INLIER_SHARE * self.size
-        self.clusters = UnexplainedClusters(self.skin, self.limbs, self.size)
+        self.clusters = (
+            clusters.scaled(self.size) if clusters else UnexplainedClusters(self.skin, self.limbs, self.size)
+        )
 
     def predict(self, state: TrackState, elapsed: float) -> Tensor:
         """Return the pose (num_dofs,) expected after some intervals."""
@@ -194,7 +197,8 @@ class FrameFitter:
             problem = replace(informed, lower=informed.lower[0], upper=informed.upper[0], prior=prior)
         viewpoint = None if frame.picture is None else frame.picture.camera.position - origin
         return FrameView(
-            problem=problem, origin=origin, rows=rows, in_reach=in_reach, elapsed=frame.elapsed, viewpoint=viewpoint
+            problem=problem, origin=origin, rows=rows, in_reach=in_reach, elapsed=frame.elapsed, viewpoint=viewpoint,
+            scan=None if self.person is None else OrientedScan.of(data, viewpoint),
         )  # fmt: skip
 
     @cached_property
@@ -249,8 +253,8 @@ class FrameFitter:
             fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=widths)
             pose = fitted.pose
         known = state.known_person
-        if self.person is not None and known is not None:
-            person = self._fitted_person(self.person, known, view, state, acquired, pose[0])
+        if self.person is not None and view.scan is not None and known is not None:
+            person = self._fitted_person(self.person, known, view, view.scan, state, acquired, pose[0])
             pose = person.pose.unsqueeze(0)
             fitted = SurfaceResult(
                 pose, *problem.surface.distance_jacobian(problem.data, pose), person.last_step.unsqueeze(0)
@@ -261,16 +265,17 @@ class FrameFitter:
         return replace(self._with_evidence(view, state, acquired, fitted, residual[0]), person=person)
 
     def _fitted_person(
-        self, person: PersonFilter, known: KnownPerson, view: FrameView, state: TrackState, acquired: str, pose: Tensor
-    ) -> PersonFit:
+        self, person: PersonFilter, known: KnownPerson, view: FrameView, scan: OrientedScan, state: TrackState,
+        acquired: str, pose: Tensor,
+    ) -> PersonFit:  # fmt: skip
         """Return the fit of pose and coefficients from a pose (num_dofs,)."""
-        data, motion = view.problem.data[0], None
+        motion = None
         if not state.tracked and acquired == "tracked":
-            return person.joined(known, data, pose, view.viewpoint)
+            return person.joined(known, scan, pose)
         if state.lost == 0 and acquired != "found":
             prior = self._prediction_prior(view.problem, state, view.elapsed)
             motion = Motion(view.problem.prior.mean[0], prior.precision.rsqrt())
-        return person.fit(known, data, pose, motion, view.viewpoint)
+        return person.fit(known, scan, pose, motion)
 
     def covariance(self, fit: FrameFit) -> tuple[Tensor, Tensor]:
         """Return the covariance (num_dofs, num_dofs) of a fit and its observed share (num_dofs,).
@@ -285,7 +290,7 @@ class FrameFitter:
         if fit.person is None:
             covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
         else:
-            covariance = fit.person.known.covariance[: len(precision), : len(precision)]
+            covariance = fit.person.known.total[: len(precision), : len(precision)]
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
     def judged(self, fit: FrameFit, covariance: Tensor) -> tuple[Evidence, bool]:
@@ -300,10 +305,10 @@ class FrameFitter:
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
             intruding=fit.intruding,
         )  # fmt: skip
-        evidence = replace(evidence, unseen=unseen_share(problem, pose, fit.distance, fit.jacobian).sqrt())
         if fit.person is not None:
             error = fit.person.error
             return replace(evidence, unknown=error.unknown(self.size)), bool(error.converged)
+        evidence = replace(evidence, unseen=unseen_share(problem, pose, fit.distance, fit.jacobian).sqrt())
         converged = float(problem.change(fit.last_step)) <= problem.pose_atol or hardly_gains(
             problem, pose, fit.distance, fit.jacobian, fit.residual[None], covariance[None]
         )

@@ -14,8 +14,9 @@ from torchreg.alignment.evidence.reliability import SurfaceError
 from torchreg.alignment.fit.problem import joint_precision, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT
 from torchreg.alignment.shape.clothing import CLOTH, clothed_rig, may_be_clothed
+from torchreg.alignment.shape.outside_term import OutsideTerm
 from torchreg.alignment.shape.shape_fit import fitted_rig, scan_normals, surface_skins
-from torchreg.alignment.shape.shape_problem import plausible_precision, robust_rows
+from torchreg.alignment.shape.shape_problem import RobustRows, plausible_precision, robust_rows
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.upright import Direction
 from torchreg.result import Status
@@ -29,17 +30,38 @@ from torchreg.solvers.levenberg_marquardt import shared_information
 class KnownPerson:
     """A Gaussian on shape coefficients, of mean (K,), and on a pose in tangent coordinates with them.
 
-    `covariance` is that of coefficients (K, K), or of pose and coefficients (D + K, D + K).
+    `covariance` is that of coefficients (K, K), or of pose and coefficients (D + K, D + K), by the noise of the frames.
+    `sensitivity` (K, P) or (D + K, P) is how they move by one deviation of the errors of the model's parts, which all
+    frames share.
     """
 
     coefficients: Tensor
     covariance: Tensor
+    sensitivity: Tensor
 
     @property
-    def alone(self) -> Tensor:
-        """The covariance (K, K) of the coefficients."""
+    def alone(self) -> KnownPerson:
+        """What is known of the coefficients."""
         count = len(self.coefficients)
-        return self.covariance[-count:, -count:]
+        return KnownPerson(self.coefficients, self.covariance[-count:, -count:], self.sensitivity[-count:])
+
+    @property
+    def total(self) -> Tensor:
+        """The covariance by noise and by errors of the model, the "consider" covariance (Schmidt 1966)."""
+        return self.covariance + self.sensitivity @ self.sensitivity.mT
+
+
+@dataclass(frozen=True, eq=False)
+class OrientedScan:
+    """Data (M, 3) of a frame and their normals (M, 3), zero where unknown."""
+
+    data: Tensor
+    normals: Tensor
+
+    @classmethod
+    def of(cls, data: Tensor, viewpoint: Tensor | None) -> OrientedScan:
+        """Return data with normals, which face the camera at a viewpoint (3,) where one is known."""
+        return cls(data, scan_normals(data, torch.ones_like(data[:, 0], dtype=torch.bool), viewpoint))
 
 
 @dataclass(frozen=True)
@@ -111,7 +133,7 @@ class PersonFilter:
             worn = torch.linalg.lstsq(modes, found.clothing_offset.to(modes)[:, None]).solution[:, 0]
             mean = torch.cat([mean, worn.to(mean)])
             covariance = torch.block_diag(covariance, torch.eye(len(worn)).to(covariance))
-        return found.pose, KnownPerson(mean, covariance)
+        return found.pose, KnownPerson(mean, covariance, covariance.new_zeros(len(mean), self.rig.num_parts))
 
     def of(self, count: int) -> None:
         """Go on with a rig of a number of coefficients, those of clothes included."""
@@ -120,45 +142,44 @@ class PersonFilter:
             with torch.inference_mode(False), torch.no_grad():
                 self._wear(clothed_rig(self._bare))
 
-    def fit(
-        self, person: KnownPerson, data: Tensor, start: Tensor, motion: Motion | None, viewpoint: Tensor | None = None
-    ) -> PersonFit:
-        """Return pose and coefficients after another frame (M, 3), from a start (D,) near its pose.
+    def fit(self, person: KnownPerson, scan: OrientedScan, start: Tensor, motion: Motion | None) -> PersonFit:
+        """Return pose and coefficients after another frame, from a start (D,) near its pose.
 
         The iterated Kalman filter as Gauss-Newton (Bell and Cathey 1993): ``|d(x, c)|^2_W + |(x, c) - (m, c_0)|^2_P``
         is least, with P the information of all frames before, whose poses are marginalized. Joints follow
         ``x = r + a (m - r) + w``, ``a^2 = 1 - q^2 / s^2``, with q the deviation of the motion and s that of poses about
         rest r: what no data show returns to rest, and is never known better or worse than it is told. Without a motion
-        poses are independent of those before.
+        poses are independent of those before. Errors of the model's parts are the same in all frames: they are
+        considered, not estimated.
         """
-        surface, valid = self._surface(data, viewpoint), torch.ones_like(data[:, 0], dtype=torch.bool)
-        center, prior = self._prior(person, start, motion)
+        terms = self._terms(scan)
+        center, prior, sensitivity = self._prior(person, start, motion)
         tree, dofs, state = self._skin.shape, self.rig.num_dofs, torch.cat([start, center[0, len(start) :]])[None]
         for _ in range(_UPDATE.steps):
-            hessian, gradient = self._normal_equations(surface, data, valid, state)
+            _, hessian, gradient = self._normal_equations(*terms, scan, state)
             gradient = gradient + prior @ tree.difference(center, state)[0].double()
             step = -torch.linalg.solve(hessian + prior, gradient).to(state)
             moved = tree.retract(state, step[None])
             inside = torch.minimum(torch.maximum(moved, tree.lower), tree.upper)
             state = torch.cat([moved[:, :6], inside[:, 6:]], dim=-1)
-        hessian, _ = self._normal_equations(surface, data, valid, state)
+        rows, hessian, _ = self._normal_equations(*terms, scan, state)
         covariance = torch.linalg.inv(hessian + prior)
+        moves = rows.part_gradients(terms[0], scan.data[None], state)[0].double()
+        sensitivity = covariance @ (prior @ sensitivity - moves)
         error = self._error(state, step, covariance)
-        known = KnownPerson(state[0, dofs:], covariance.to(person.covariance))
+        known = KnownPerson(state[0, dofs:], covariance.to(state), sensitivity.to(state))
         return PersonFit(state[0, :dofs], step[:dofs], known, error)
 
-    def joined(self, person: KnownPerson, data: Tensor, pose: Tensor, viewpoint: Tensor | None = None) -> PersonFit:
+    def joined(self, person: KnownPerson, scan: OrientedScan, pose: Tensor) -> PersonFit:
         """Return a person found by `initialize`, together with a pose (D,), in a frame that counts once."""
-        surface, valid = self._surface(data, viewpoint), torch.ones_like(data[:, 0], dtype=torch.bool)
-        state = torch.cat([pose, person.coefficients.to(pose)])[None]
-        hessian, _ = self._normal_equations(surface, data, valid, state)
+        state, count = torch.cat([pose, person.coefficients.to(pose)])[None], len(person.coefficients)
+        _, hessian, _ = self._normal_equations(*self._terms(scan), scan, state)
         known = torch.linalg.inv(person.covariance.double())
         hessian = hessian + torch.cat([self._precision, known.diagonal()]).diag()
         error = self._error(state, torch.zeros_like(state[0]), torch.linalg.inv(hessian))
-        count = len(person.coefficients)
-        told = shared_information(hessian, self.rig.num_dofs)
-        hessian[-count:, -count:] += known - told
-        joint = KnownPerson(person.coefficients, torch.linalg.inv(hessian).to(person.covariance))
+        hessian[-count:, -count:] += known - shared_information(hessian, self.rig.num_dofs)
+        sensitivity = pad(person.sensitivity, (0, 0, self.rig.num_dofs, 0))
+        joint = KnownPerson(person.coefficients, torch.linalg.inv(hessian).to(person.covariance), sensitivity)
         return PersonFit(pose, torch.zeros_like(pose), joint, error)
 
     def _error(self, state: Tensor, last_step: Tensor, covariance: Tensor) -> SurfaceError:
@@ -167,13 +188,13 @@ class PersonFilter:
         moved = (moves @ last_step).square().sum(-1).mean(-1).sqrt()
         return SurfaceError.of(self._model, moves, covariance[None].to(state), moved)
 
-    def _prior(self, person: KnownPerson, start: Tensor, motion: Motion | None) -> tuple[Tensor, Tensor]:
-        """Return the mean (1, D + K) of pose and coefficients before a frame, and its information (D + K, D + K)."""
+    def _prior(self, person: KnownPerson, start: Tensor, motion: Motion | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the mean (1, D + K) of pose and coefficients before a frame, its information and its sensitivity."""
         dofs, count = self.rig.num_dofs, len(person.coefficients)
         if motion is None or len(person.covariance) == count:
-            information = torch.linalg.inv(person.alone.double())
-            center = torch.cat([start, person.coefficients.to(start)])[None]
-            return center, torch.block_diag(self._precision.diag(), information)
+            alone, center = person.alone, torch.cat([start, person.coefficients.to(start)])[None]
+            information = torch.block_diag(self._precision.diag(), torch.linalg.inv(alone.covariance.double()))
+            return center, information, pad(alone.sensitivity, (0, 0, dofs, 0)).double()
         moved, kept = pad(motion.std.double().square(), (0, count)), torch.ones(dofs + count, dtype=torch.float64)
         kept[6:dofs] = (1 - moved[6:dofs] * self._precision[6:]).clamp_min(0).sqrt()
         moved[6:dofs] = (1 - kept[6:dofs].square()) / self._precision[6:]
@@ -181,11 +202,15 @@ class PersonFilter:
         joints = rest + kept[6:dofs].to(rest) * (motion.pose[6:] - rest)
         center = torch.cat([motion.pose[:6], joints, person.coefficients.to(start)])[None]
         covariance = kept.unsqueeze(-1) * person.covariance.double() * kept + moved.diag()
-        return center, torch.linalg.inv(covariance)
+        return center, torch.linalg.inv(covariance), kept.unsqueeze(-1) * person.sensitivity.double()
 
-    def _surface(self, data: Tensor, viewpoint: Tensor | None) -> ShapedSurface:
-        normals = scan_normals(data, torch.ones_like(data[:, 0], dtype=torch.bool), viewpoint)
-        return ShapedSurface(self._skin, normals[None], SURFACE_FIT.max_width * self._size)
+    def _terms(self, scan: OrientedScan) -> tuple[ShapedSurface, OutsideTerm | None]:
+        """Return the surface for a scan, and what skin outside of it costs where it is closed."""
+        data, normals = scan.data[None], scan.normals[None]
+        surface = ShapedSurface(self._skin, normals, SURFACE_FIT.max_width * self._size)
+        valid = torch.ones_like(data[..., 0], dtype=torch.bool)
+        outside = OutsideTerm.of_scans(self._model, data, valid, normals, self._size)
+        return surface, outside if bool(outside.weight.any()) else None
 
     def differs(self, first: Tensor, second: Tensor) -> bool:
         """Return whether two people with coefficients (K,) differ, at rest, by more than a model is exact."""
@@ -194,10 +219,15 @@ class PersonFilter:
         return float(moved) > SURFACE_FIT.min_noise(self._size)
 
     def _normal_equations(
-        self, surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the Gauss-Newton Hessian (D + K, D + K) and the gradient (D + K,) of the data alone, float64."""
-        rows = robust_rows(surface, data[None], valid[None], state, self._size)
+        self, surface: ShapedSurface, outside: OutsideTerm | None, scan: OrientedScan, state: Tensor
+    ) -> tuple[RobustRows, Tensor, Tensor]:
+        """Return the data's rows, and Gauss-Newton Hessian (D + K, D + K) and gradient (D + K,) of a frame, float64."""
+        data = scan.data[None]
+        rows = robust_rows(surface, data, torch.ones_like(data[..., 0], dtype=torch.bool), state, self._size)
         factor = (rows.weights.sqrt() / rows.noise.unsqueeze(-1))[0].double()
         jacobian = rows.jacobian[0].double() * factor.unsqueeze(-1)
-        return jacobian.mT @ jacobian, jacobian.mT @ (rows.distance[0].double() * factor)
+        hessian, gradient = jacobian.mT @ jacobian, jacobian.mT @ (rows.distance[0].double() * factor)
+        if outside is None:
+            return rows, hessian, gradient
+        found = outside.linearized(state, rows.width, rows.noise)
+        return rows, hessian + found.hessian[0].double(), gradient + found.gradient[0].double()

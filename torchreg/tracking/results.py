@@ -129,9 +129,9 @@ class TrackState(Result):
         seed: of all random draws.
         origin: (3,) float64 about which all this is, where clouds lie far from that of coordinates; None elsewhere.
         coefficients: (C,) of the person tracked, where they are fitted and a frame showed any.
-        coefficient_covariance: (C, C) of them.
-        person_covariance: (D + C, D + C) of pose and coefficients, in tangent coordinates; None before the first fit
-            that was usable and after one that was not.
+        person_covariance: (D + C, D + C) of pose and coefficients, in tangent coordinates, by the noise of the frames;
+            (C, C) of coefficients alone before the first fit that was usable and after one that was not.
+        person_sensitivity: (D + C, P) or (C, P) how they move by errors of the model's parts, which frames share.
         person: (C,) coefficients of the rig that is followed; another one is made when its surface is off.
         sure: whether the fit to any frame was usable.
         searched: (F, 3) some data of the last frame that was searched, before the shape was first found; then None.
@@ -139,8 +139,8 @@ class TrackState(Result):
 
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "velocity": "D", "points": "N 3", "weights": "N P", "reference_pose": "D", "keyframes": "K D",
-        "unexplained": "S 3", "innovation": "3", "coefficients": "C", "coefficient_covariance": "C C", "person": "C",
-        "person_covariance": "J J", "searched": "F 3",
+        "unexplained": "S 3", "innovation": "3", "coefficients": "C", "person": "C", "person_covariance": "J J",
+        "person_sensitivity": "J Q", "searched": "F 3",
     }  # fmt: skip
 
     frame: int
@@ -167,8 +167,8 @@ class TrackState(Result):
     seed: int
     origin: Tensor | None = None
     coefficients: Tensor | None = None
-    coefficient_covariance: Tensor | None = None
     person_covariance: Tensor | None = None
+    person_sensitivity: Tensor | None = None
     person: Tensor | None = None
     sure: bool = True
     searched: Tensor | None = None
@@ -181,10 +181,9 @@ class TrackState(Result):
     @property
     def known_person(self) -> KnownPerson | None:
         """What is known of coefficients, and of the last pose with them after a usable frame."""
-        if self.coefficients is None or self.coefficient_covariance is None:
+        if self.coefficients is None or self.person_covariance is None or self.person_sensitivity is None:
             return None
-        joint = self.coefficient_covariance if self.person_covariance is None else self.person_covariance
-        return KnownPerson(self.coefficients, joint)
+        return KnownPerson(self.coefficients, self.person_covariance, self.person_sensitivity)
 
     @property
     def tracked(self) -> bool:

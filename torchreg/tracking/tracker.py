@@ -111,6 +111,7 @@ class Tracker:
             model_points = check_skin(shape, model_points)
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
+            self._mean_clusters = self._fitter.clusters
             self._recover = Recovery(
                 self._fitter, StartSource.of(shape, initializer=initializer, upright=self.config.upright)
             )  # fmt: skip
@@ -284,18 +285,17 @@ class Tracker:
             return state
         pose, known = met
         self._follow(known.coefficients)
-        return replace(
-            state, pose=pose, person=known.coefficients, coefficients=known.coefficients,
-            coefficient_covariance=known.covariance,
-        )  # fmt: skip
+        return replace(_with_person(state, known), pose=pose, person=known.coefficients)
 
     def _with_coefficients(self, result: FrameResult) -> FrameResult:
         """Return a frame's result with what is known of the body's coefficients."""
-        mean, covariance = self._state.coefficients, self._state.coefficient_covariance
-        if self._person is None or mean is None or covariance is None:
+        known = self._state.known_person
+        if self._person is None or known is None:
             return result
-        count = self._person.body_count
-        return replace(result, coefficients=mean[:count], coefficient_covariance=covariance[:count, :count])
+        count, covariance = self._person.body_count, known.alone.total
+        return replace(
+            result, coefficients=known.coefficients[:count], coefficient_covariance=covariance[:count, :count]
+        )
 
     def _follow(self, coefficients: Tensor | None) -> None:
         """Go on with the rig of a person with coefficients (K,), where there is one and it is another."""
@@ -305,7 +305,7 @@ class Tracker:
             return
         self.shape, self._followed = self._person.rig.with_coefficients(coefficients), coefficients
         with torch.no_grad():
-            self._fitter = FrameFitter(self.shape, self.config, None, self._person)
+            self._fitter = FrameFitter(self.shape, self.config, None, self._person, self._mean_clusters)
             self._recover = Recovery(self._fitter, StartSource.of(self.shape, upright=self.config.upright))
 
     def _follow_closer(self) -> None:
@@ -414,11 +414,10 @@ class Tracker:
 
     def _forgotten(self, state: TrackState) -> TrackState:
         """Return a state as before the first fit, at the same frame."""
-        names = ["frame", "time", "interval", "origin", "coefficients", "coefficient_covariance", "person", "lost"]
+        names = ["frame", "time", "interval", "origin", "person", "lost"]
         kept = {name: getattr(state, name) for name in names}
-        return replace(
-            initial_state(self._fitter.skin, torch.full_like(state.pose, torch.nan), self.config.seed), **kept
-        )
+        first = initial_state(self._fitter.skin, torch.full_like(state.pose, torch.nan), self.config.seed)
+        return _with_person(replace(first, **kept), state.known_person and state.known_person.alone)
 
     def _accept(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame with the best fit that was found, and the state after it."""
@@ -428,7 +427,7 @@ class Tracker:
         result = fitted_result(self._fitter, state, frame, fit, covariance)
         after, usable = self._state_after(state, frame, fit, observed), result.statuses[0].usable
         if fit.person is not None:
-            after = _with_person(after, fit.person.known if usable else None)
+            after = _with_person(after, fit.person.known if usable else state.known_person and state.known_person.alone)
         return result, replace(after, sure=after.sure or usable)
 
     def _state_after(self, state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
@@ -458,14 +457,14 @@ class Tracker:
             status = Status.NOT_FOUND
         pose = self._fitter.predict(state, frame.elapsed)
         after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
-        after = _with_person(after, None)
+        after = _with_person(after, state.known_person and state.known_person.alone)
         return predicted_result(self._fitter, state, frame, pose, status), after
 
 
 def _with_person(state: TrackState, known: KnownPerson | None) -> TrackState:
-    """Return the state with what is known of a person; without it, only the coefficients of before are."""
+    """Return the state with what is known of a person, if there is one."""
     if known is None:
-        return replace(state, person_covariance=None)
+        return state
     return replace(
-        state, coefficients=known.coefficients, coefficient_covariance=known.alone, person_covariance=known.covariance
-    )  # fmt: skip
+        state, coefficients=known.coefficients, person_covariance=known.covariance, person_sensitivity=known.sensitivity
+    )

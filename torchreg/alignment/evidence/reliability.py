@@ -53,7 +53,7 @@ class Evidence:
         clusters: root of the data in dense clusters off the surface, as a share of those on it.
         off: share of the data that are not on the surface.
         free_space: root of the data that points in free space stand for, as a share of the data.
-        unseen: root of the `unseen_share`; zero where pictures tell what is there.
+        unseen: root of the `unseen_share`; zero where pictures tell what is there, and for fits with coefficients.
         unknown: probability that the data do not determine the ends of the limbs.
         rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
         open_rim: square of `open_rims`; zero for clouds.
@@ -207,34 +207,37 @@ def judge(
     frames: Sequence[DepthFrame] = (),
     rivals: Tensor | None = None,
     in_picture: bool = False,
+    covariance: Tensor | None = None,
 ) -> Judgement:
     """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`.
 
-    ``in_picture``: whether the frames are crops of whole pictures, which may show something else; a mask says what is
-    there.
+    ``error`` and ``covariance`` are those of a fit with shape coefficients. ``in_picture``: whether the frames are
+    crops of whole pictures, which may show something else; a mask says what is there.
     """
-    residuals = SurfaceResiduals.of(problem, pose)
-    spreads = end_spreads(problem, pose, residuals)
     picture = PictureEvidence.of(problem, pose, frames) if frames else None
-    evidence = gather_evidence(problem, pose, residuals.distance, lead, spreads)
-    loose = spreads > EVIDENCE.tolerance * problem.size
+    shape, calibration = problem.skin.shape, PICTURE_CALIBRATION if in_picture else CALIBRATION
+    if error is None or covariance is None:
+        residuals = SurfaceResiduals.of(problem, pose)
+        distance, spreads = residuals.distance, end_spreads(problem, pose, residuals)
+        evidence = gather_evidence(problem, pose, distance, lead, spreads)
+        loose = spreads > EVIDENCE.tolerance * problem.size
+        if picture is None:
+            evidence = replace(evidence, unseen=unseen_share(problem, pose, distance, residuals.jacobian).sqrt())
+        else:
+            residuals = replace(residuals, contradicted=picture.contradicted)
+            loose = loose | (picture.misplaced > CALIBRATION.doubtful)
+        around = curvature(problem, pose, residuals)
+        converged, covariance = around.converged, _with_far_poses(problem, pose, residuals, around)
+    else:
+        distance, calibration = problem.surface.distance(problem.data, pose), SHAPE_CALIBRATION
+        evidence = gather_evidence(problem, pose, distance, lead, torch.zeros_like(pose[:, :1]))
+        evidence, converged = replace(evidence, unknown=error.unknown(problem.size)), error.converged
+        loose = error.loose([limb for limb, _ in limb_points(problem.skin)], problem.size)
     if picture is not None:
-        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, residuals.distance)
+        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, distance)
         evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
         if in_picture:
             evidence = replace(evidence, elsewhere=picture.elsewhere.square(), misplaced=picture.misplaced.mean(-1))
-        residuals = replace(residuals, contradicted=picture.contradicted)
-        loose = loose | (picture.misplaced > CALIBRATION.doubtful)
-    else:
-        unseen = unseen_share(problem, pose, residuals.distance, residuals.jacobian)
-        evidence = replace(evidence, unseen=unseen.sqrt())
-    around, calibration = curvature(problem, pose, residuals), PICTURE_CALIBRATION if in_picture else CALIBRATION
-    converged, shape = around.converged, problem.skin.shape
-    if error is not None:
-        evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
-        limbs = [limb for limb, _ in limb_points(problem.skin)]
-        converged, loose = error.converged, error.loose(limbs, problem.size)
-    covariance = _with_far_poses(problem, pose, residuals, around)
     left_open = [told_open(shape, row, problem.size) for row in covariance]
     return Judgement(
         covariance=covariance,

@@ -67,9 +67,12 @@ class OutsideTerm(Factor):
 
     def linearized(self, pose: Tensor, sigma: Tensor, noise: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at states (B, D + K)."""
-        rows, derivative = self.skin.row_jacobian(pose)
-        outside, normal = (value[:, 0] for value in self._outside(self.skin.place(rows).unsqueeze(1)))
-        jacobian = (normal.unsqueeze(-2) @ derivative).squeeze(-2) * (outside > 0).unsqueeze(-1)
+        points, _, along = self.skin.lazy_normal_jacobian(pose)
+        outside, normal = (value[:, 0] for value in self._outside(points.unsqueeze(1)))
+        # Points that are not outside cost nothing.
+        index = (outside > 0).any(0).nonzero()[:, 0]
+        outside = outside[:, index]
+        jacobian = along(index, normal[:, index]) * (outside > 0).unsqueeze(-1)
         return welsch_system(outside, jacobian, self.weight.unsqueeze(-1), sigma, noise)
 
     def _outside(self, points: Tensor) -> tuple[Tensor, Tensor]:

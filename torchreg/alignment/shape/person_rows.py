@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.confidence import EVIDENCE, leaves_clusters
-from torchreg.alignment.evidence.curvature import dof_confidence
 from torchreg.alignment.fit.annealed_em import ANNEALING, SigmaSchedule, StageResult, anneal
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
@@ -212,6 +211,9 @@ class PersonRows:
 
     def _clothed_where_likelier(self, bare: FoundPerson) -> FoundPerson:
         """Return a person in clothes where the data of the scan are likelier with them, else the bare one."""
+        # Neighbors share no more of the residuals than a model of bare skin errs: nothing is left for clothes.
+        if bool(bare.fitted.shared <= SURFACE_FIT.min_noise(self.problem.size)):
+            return bare
         with torch.inference_mode(False), torch.no_grad():
             task = replace(self.task, shape=clothed_rig(self.task.shape), clothed=True)
         data, valid = self.problem.data + self.problem.origin.unsqueeze(1), self.problem.valid
@@ -236,7 +238,7 @@ class PersonRows:
         group = member.to(state)
         for _ in range(SHAPE_FIT.fine_steps):
             precision = problem.prior.precision[dofs:] * problem.scans
-            covariance = shared_covariance(noise_covariance(problem, state), dofs)
+            covariance = shared_covariance(noise_covariance(problem, problem.robust_rows(state)), dofs)
             told = (1 - covariance.diagonal() * precision).clamp(0, 1)
             squares = (state[0, dofs:] - space.mean).square() @ group + (space.std.square() @ group) / group.sum(0)
             variance = squares / (told @ group + 1)
@@ -264,12 +266,9 @@ class FoundPerson:
         rows = PoseRows.centered(person, person.skin(), clouds, valid, fitted.poses)
         found = StageResult(pose=rows.start, sigma=fitted.sigma, change=fitted.change)
         rows = replace(rows, found=found, lead=fitted.lead, history=self.history)
-        covariance = fitted.covariance[0, :dofs, :dofs]
         result = normal_copy(replace(
-            rows.judged(fitted.error),
+            rows.judged(fitted.error, fitted.covariance[:, :dofs, :dofs]),
             coefficients=coefficients,
-            covariance=covariance,
-            dof_confidence=dof_confidence(shape, covariance, rows.problem.size),
             coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
             clothing_offset=fitted.clothing,
         ))  # fmt: skip

@@ -64,8 +64,8 @@ class FittedShape:
     """Poses (T, D) and coefficients (K,) of a fit, with covariances (T, D + K, D + K) in tangent coordinates.
 
     `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
-    state is worse in a search. `rig` has those of clothes as its last coefficients, where there may be any, of which
-    those lie off the skin by `clothing` (V,), metres.
+    state is worse in a search; `shared` (T,) is the deviation of errors that neighbors share, metres. `rig` has
+    those of clothes as its last coefficients, where there may be any, lying off the skin by `clothing` (V,), metres.
     """
 
     poses: Tensor
@@ -75,6 +75,7 @@ class FittedShape:
     sigma: Tensor
     change: Tensor
     error: SurfaceError
+    shared: Tensor
     problem: ShapeProblem
     state: Tensor
     rig: ArticulatedShape
@@ -108,15 +109,17 @@ def fitted_shape(problem: ShapeProblem, before: Tensor, found: StageResult, shap
     if isinstance(space, ClothedSpace):
         clothing = space.clothing_offset(coefficients[0])
     known = shape.num_dofs + len(body)
-    covariance = noise_covariance(problem, found.pose)
+    rows = problem.robust_rows(found.pose)
+    covariance = noise_covariance(problem, rows)
     return FittedShape(
         poses=poses + pad(problem.origin, (0, shape.num_dofs - 3)),
         coefficients=coefficients[0, : len(body)],
-        covariance=with_errors_of_parts(problem, found.pose, covariance)[:, :known, :known],
+        covariance=with_errors_of_parts(problem, found.pose, rows, covariance)[:, :known, :known],
         cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
         error=_surface_error(problem, before, found.pose, covariance[:, :known, :known]),
+        shared=rows.shared,
         problem=problem,
         state=found.pose,
         rig=shape,

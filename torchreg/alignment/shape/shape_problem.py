@@ -48,6 +48,10 @@ class ShapeProblem(AlignProblem):
         """Return the cost (S,) by which people are ranked."""
         return alignment_cost(self, state).unflatten(0, (-1, self.scans)).sum(-1)
 
+    def robust_rows(self, state: Tensor) -> RobustRows:
+        """Return the data as rows of a least-squares problem in states (B, D + K)."""
+        return robust_rows(self.surface, self.data, self.valid, state, self.size)
+
     @property
     def shared(self) -> SharedRows:
         """The scans of a person share coefficients."""
@@ -65,40 +69,35 @@ class _PartErrors:
 _PART_ERRORS = _PartErrors()
 
 
-def noise_covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
-    """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
-    rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
-    precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
-    return pose_covariance(rows.jacobian, rows.weights, rows.noise, precision.expand_as(state))
-
-
-def with_errors_of_parts(problem: ShapeProblem, state: Tensor, covariance: Tensor) -> Tensor:
-    """Return the "consider" covariance (T, D + K, D + K) of states: the data of a part share an error of its surface.
-
-    It is ``C + tau^2 G G^T``, ``G = C J^T W S`` with S (M, P) the data of each part and C ``covariance`` (Schmidt
-    1966): folds of skin and cloth, and tangent planes in place of a surface, put all data of a part off by some tau.
-    """
-    rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
-    nearest = problem.surface.nearest(problem.data, state)[1]
-    shaped = problem.surface.shaped
-    part = one_hot(shaped.weights.argmax(-1)[nearest], shaped.weights.shape[1]).to(state)
-    weighted = rows.jacobian * (rows.weights / rows.noise.square().unsqueeze(-1)).unsqueeze(-1)
-    error = _PART_ERRORS.shared * surface_noise(rows.distance, problem.valid, problem.size)
-    moved = error[:, None, None] * (covariance @ (weighted.mT @ part))
-    return covariance + moved @ moved.mT
-
-
 @dataclass(frozen=True)
 class RobustRows:
     """Distances (B, M) in metres, Jacobian (B, M, D + K) and Welsch weights of data as rows of a least-squares problem.
 
     `noise` (B,) is the deviation of each datum as if all were independent: larger where neighbors err together.
+    `residual` (B,) is that of distances, `shared` (B,) that of the errors which neighbors share, metres.
     """
 
     distance: Tensor
     jacobian: Tensor
     weights: Tensor
     noise: Tensor
+    residual: Tensor
+    shared: Tensor
+
+    @property
+    def width(self) -> Tensor:
+        """The width (B,) of the kernel, metres."""
+        return SURFACE_FIT.width_per_noise * self.residual
+
+    def part_gradients(self, surface: ShapedSurface, data: Tensor, state: Tensor) -> Tensor:
+        """Return how the gradient (B, D + K) moves by the errors (B, D + K, P) of the surface of parts, one deviation.
+
+        Folds of skin and cloth, and tangent planes in place of a surface, put all data of a part off.
+        """
+        nearest, shaped = surface.nearest(data, state)[1], surface.shaped
+        part = one_hot(shaped.weights.argmax(-1)[nearest], shaped.weights.shape[1]).to(state)
+        weighted = self.jacobian * (self.weights / self.noise.square().unsqueeze(-1)).unsqueeze(-1)
+        return (_PART_ERRORS.shared * self.residual)[:, None, None] * (weighted.mT @ part)
 
 
 def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor, size: float) -> RobustRows:
@@ -106,8 +105,28 @@ def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tens
     distance, jacobian = surface.distance_jacobian(data, state)
     noise = surface_noise(distance, valid, size)
     near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * valid
-    shared = correlated_count(neighbor_correlation(data, distance, near))
-    return RobustRows(distance, jacobian=jacobian, weights=near, noise=noise * shared.clamp_min(1).sqrt())
+    correlation = neighbor_correlation(data, distance, near)
+    count = correlated_count(correlation).clamp_min(1)
+    return RobustRows(
+        distance, jacobian=jacobian, weights=near, noise=noise * count.sqrt(), residual=noise,
+        shared=noise * correlation.sqrt(),
+    )  # fmt: skip
+
+
+def noise_covariance(problem: ShapeProblem, rows: RobustRows) -> Tensor:
+    """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
+    precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
+    return pose_covariance(rows.jacobian, rows.weights, rows.noise, precision.expand(len(rows.noise), -1))
+
+
+def with_errors_of_parts(problem: ShapeProblem, state: Tensor, rows: RobustRows, covariance: Tensor) -> Tensor:
+    """Return the "consider" covariance (T, D + K, D + K) of states: the data of a part share an error of its surface.
+
+    It is ``C + G G^T``, ``G = C J^T W S tau`` with S (M, P) the data of each part, tau the deviation of their error and
+    C ``covariance`` (Schmidt 1966).
+    """
+    moved = covariance @ rows.part_gradients(problem.surface, problem.data, state)
+    return covariance + moved @ moved.mT
 
 
 def plausible_precision(rig: Articulation, size: float, precision: Tensor) -> Tensor:
