@@ -144,7 +144,7 @@ class Followed:
 def follow(shape: tr.ArticulatedShape, clip: Clip, *, smooth: bool = False) -> Followed:
     """Return what a tracker makes of a clip, and a second pass where that is wanted."""
     tracker = tr.Tracker(shape, clip.start, fit_shape=True, config=tr.TrackConfig(upright=clip.up))
-    bodies, statuses, confidences, covered, ticks = [], [], [], [], [time.process_time()]
+    bodies, statuses, confidences, known, ticks = [], [], [], [], [time.process_time()]
     data = [points.float() for points in clip.data]
 
     def note(points: Tensor, result: tr.FrameResult) -> None:
@@ -152,12 +152,15 @@ def follow(shape: tr.ArticulatedShape, clip: Clip, *, smooth: bool = False) -> F
         bodies.append(shape.vertices(result.pose, result.coefficients).double())
         statuses.append(result.status)
         confidences.append(float(result.confidence))
-        known = tracker.state.known_person
-        if clip.phenotypes is not None and known is not None and len(known.covariance) > len(known.coefficients):
-            covered.append(coverage(shape, result.pose, known, clip.joints[len(bodies) - 1], clip.phenotypes))
+        known.append((result.pose, tracker.state.known_person))
 
     track = tracker.run(data, note)
     seconds = torch.tensor(ticks, dtype=torch.float64).diff().tolist()
+    covered = [] if clip.phenotypes is None else [
+        coverage(shape, pose, person, joints, clip.phenotypes)
+        for (pose, person), joints in zip(known, clip.joints, strict=True)
+        if person is not None and len(person.covariance) > len(person.coefficients)
+    ]  # fmt: skip
     if not smooth:
         return Followed(bodies, statuses, confidences, seconds, covered)
     again = tr.smooth_track(track, data)
