@@ -9,7 +9,8 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
 - the search for poses: `PoseSearch`, `StartSource`, `HoldsProposer`, `Candidates`, `Plan`;
 - evidence beside the data: `Factor`, `FreeSpaceTerm`, `free_space_loss`; what is known beforehand: `KnownDofs`;
   measured keypoints: `MeasuredKeypoints`, `keypoint_skin`;
-- shape coefficients: `fitted_rig`, `scan_normals`, `surface_skins`, `plausible_precision`, `robust_rows`;
+- shape coefficients: `fitted_rig`, `scan_normals`, `surface_skins`, `plausible_precision`, `robust_rows`, `RobustRows`;
+  what lies outside of a closed scan: `OutsideTerm`;
   clothes: `CLOTH`, `clothed_rig`, `may_be_clothed`; the network that proposes people: `PersonProposer`, `is_body`;
 - what can be trusted: `Evidence`, `weigh`, `hardly_gains`, `limb_ends`, `end_motions`, `end_variances`,
   `correlated_count`, `neighbor_correlation`, `dof_confidence`, `unseen_share`, `SurfaceError`; in words `spread_of`;
