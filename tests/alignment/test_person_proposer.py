@@ -14,6 +14,7 @@ from torchreg.alignment.shape.shape_fit import shape_problem
 from torchreg.datasets import people_batches
 from torchreg.datasets.people_poses import people_states
 from torchreg.geometry.mesh import sample_surface
+from torchreg.geometry.rotation import compose_rotation_vectors
 
 TINY = tr.ProposerSize(tokens=16, neighbors=4, width=16, heads=2, encoder=1, decoder=1, hypotheses=4, waves=2)
 QUICK = tr.AlignConfig(num_model_points=150, search="never")
@@ -105,6 +106,23 @@ def test_a_good_proposal_needs_no_search_and_a_bad_one_is_searched_for(body, sit
     assert searched
     with pytest.raises(tr.errors.InputError, match="a PersonProposer with fit_shape"):
         tr.align(body, points, initializer=wrong)
+
+
+def test_beside_a_start_a_network_proposes_people_on_the_same_data(body, sitter):
+    state, points = sitter
+    pose, coefficients = state.tensor_split([body.num_dofs])
+    flipped, middle = pose.clone(), body.keypoints(pose).mean(0)
+    flipped[3:6] = compose_rotation_vectors(torch.tensor([torch.pi, 0.0, 0.0]), flipped[3:6])
+    flipped[:3] += middle - body.keypoints(flipped).mean(0)
+
+    def off(start, *, right):
+        network = told(body, state, points, right=right)
+        found = tr.align(body, points, start, fit_shape=True, clothed=False, initializer=network, config=QUICK)
+        vertices = body.vertices(found.pose, found.coefficients) - body.vertices(pose, coefficients)
+        return float(vertices.norm(dim=-1).mean())
+
+    assert off(flipped, right=True) < 0.03 < 0.1 < off(flipped, right=False)
+    assert off(pose, right=False) < 0.03
 
 
 def test_training_by_the_one_command_and_files(body, tmp_path, monkeypatch):

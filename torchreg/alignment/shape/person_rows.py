@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.confidence import EVIDENCE, leaves_clusters
 from torchreg.alignment.fit.annealed_em import ANNEALING, SigmaSchedule, StageResult, anneal
+from torchreg.alignment.fit.problem import INLIER_SHARE
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.alignment.inputs import Task, check_clouds
 from torchreg.alignment.pose_rows import PoseRows
@@ -85,12 +86,41 @@ class PersonRows:
 
     def searched_too(self) -> PersonRows:
         """Return the fitted rows that a network proposed together with those of people searched for in the one scan."""
-        data, valid = self.problem.data[:1] + self.problem.origin[:1].unsqueeze(1), self.problem.valid[:1]
-        rows = PersonRows.of_scans(self.task, data, valid, None, proposes=False)
+        return replace(
+            self._joined(PersonRows.of_scans(self.task, *self._scan, None, proposes=False)), is_proposed=False
+        )
+
+    def _proposed_too(self) -> PersonRows:
+        """Return the rows fitted from a start, and those that a network proposes for the data on which the best lies.
+
+        A start may be turned half about, and the data of a flipped person are nearly as likely.
+        """
+        proposer = self.task.people or shipped_people(self.task.shape)
+        if proposer is None or self._searched or self.problem.scans > 1:
+            return self
+        best, task = self._best(), replace(self.task, start=None, people=proposer)
+        rows = self._joined(PersonRows.of_scans(task, *self._scan, None))
+        distance = rows.coarse.surface.distance(rows.coarse.data, rows.state)
+        near = (distance.abs() < INLIER_SHARE * self.problem.size) & rows.coarse.valid
+        # Another person in the data is not the one that is meant.
+        alike = (near & near[best]).sum(-1) >= SHAPE_FIT.same_data * near[best].sum(-1)
+        own = torch.arange(len(alike)) < len(self.state)
+        return rows._chosen((alike | own).nonzero()[:, 0])
+
+    @property
+    def _scan(self) -> tuple[Tensor, Tensor]:
+        """The data (1, M, 3) of the first scan in the world, and which of them are valid."""
+        return self.problem.data[:1] + self.problem.origin[:1].unsqueeze(1), self.problem.valid[:1]
+
+    def _joined(self, rows: PersonRows) -> PersonRows:
+        """Return the fitted rows of one scan with others, which are fitted first."""
         state = torch.cat([self.state, replace(rows, history=self.history).annealed().fitted().state])
         every = torch.zeros(len(state), dtype=torch.int64)
-        problem, coarse = self.problem.rows(every), self.coarse.rows(every)
-        return replace(self, problem=problem, coarse=coarse, state=state, is_proposed=False)
+        return replace(self, problem=self.problem.rows(every), coarse=self.coarse.rows(every), state=state)
+
+    def _chosen(self, index: Tensor) -> PersonRows:
+        """Return some rows."""
+        return replace(self, problem=self.problem.rows(index), coarse=self.coarse.rows(index), state=self.state[index])
 
     def record(self, step: AlignRecord) -> None:
         """Keep the record of a step and pass it on, with the poses alone, in the coordinates of the data."""
@@ -113,8 +143,7 @@ class PersonRows:
         found = self._anneal(self.coarse, self.state, widths)
         count = SHAPE_FIT.num_found_kept if self._searched else SHAPE_FIT.num_kept
         kept = self.problem.people(self.coarse.cost_of_people(found.pose).argsort()[:count])
-        problem, coarse = self.problem.rows(kept), self.coarse.rows(kept)
-        return replace(self, problem=problem, coarse=coarse, state=found.pose[kept], sigma=found.sigma[:1])
+        return replace(self, state=found.pose, sigma=found.sigma[:1])._chosen(kept)
 
     def fitted(self) -> PersonRows:
         """Return the rows fitted to the surface, and again after a narrower annealing, where that explains more."""
@@ -135,9 +164,12 @@ class PersonRows:
         return self.coarse.cost_of_people(self.state).argmin().unsqueeze(0)
 
     def restarted(self) -> PersonRows:
-        """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over."""
-        state = self._restarted_limb() if self.problem.scans == 1 else self.state
-        return replace(self, state=state).best()
+        """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over.
+
+        Beside a start, people that a network proposes are tried.
+        """
+        rows = self._proposed_too()
+        return replace(rows, state=rows._restarted_limb() if self.problem.scans == 1 else self.state).best()
 
     def best(self) -> PersonRows:
         """Return the row of the best person."""

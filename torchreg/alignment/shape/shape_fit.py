@@ -44,6 +44,7 @@ class ShapeFit:
     num_kept: int = 2  # starts that are still fitted to the surface
     num_found: int = 8  # starts that a search without a given one hands on: sizes and turned people
     num_proposed: int = 4  # starts that a network hands on: front and back, or of two limbs either
+    same_data: float = 0.95  # of what a start's fit lies on, that is on what a network proposes, if both are one person
     num_found_kept: int = 3  # of those: the back of a person looks much like its front
     coarse_data: int = 1000  # of each scan, by which starts are told apart
     fine_data: int = 1500  # of each scan, before all of them count
