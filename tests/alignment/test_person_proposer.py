@@ -115,13 +115,15 @@ def test_beside_a_start_a_network_proposes_people_on_the_same_data(body, sitter)
     flipped[3:6] = compose_rotation_vectors(torch.tensor([torch.pi, 0.0, 0.0]), flipped[3:6])
     flipped[:3] += middle - body.keypoints(flipped).mean(0)
 
-    def off(start, *, right):
+    def off(start, *, right, search="auto"):
         network = told(body, state, points, right=right)
-        found = tr.align(body, points, start, fit_shape=True, clothed=False, initializer=network, config=QUICK)
+        config = replace(QUICK, search=search)
+        found = tr.align(body, points, start, fit_shape=True, clothed=False, initializer=network, config=config)
         vertices = body.vertices(found.pose, found.coefficients) - body.vertices(pose, coefficients)
         return float(vertices.norm(dim=-1).mean())
 
     assert off(flipped, right=True) < 0.03 < 0.1 < off(flipped, right=False)
+    assert off(flipped, right=True, search="never") > 0.1
     assert off(pose, right=False) < 0.03
 
 

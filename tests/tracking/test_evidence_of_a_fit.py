@@ -110,6 +110,14 @@ def test_limbs_reach_the_space_within_their_limits_but_not_behind_the_wrist(reac
     assert bool(LimbReach(plain_hand_skin, [], CELL)(9 * behind, torch.eye(4)).all())
 
 
+def test_limbs_of_a_larger_shape_reach_as_far_in_its_own_size(reach):
+    points = 0.08 * torch.randn(500, 3, generator=torch.Generator().manual_seed(3))
+    wanted = reach(points, torch.eye(4))
+    assert 0.1 < float(wanted.float().mean()) < 0.9
+    assert torch.equal(reach.scaled(4.0)(4 * points, torch.eye(4)), wanted)
+    assert not torch.equal(reach(4 * points, torch.eye(4)), wanted)
+
+
 def test_unexplained_clusters_are_as_dense_as_the_surface(plain_hand_skin):
     generator = torch.Generator().manual_seed(2)
     sheet, patch = torch.rand(400, 3, generator=generator), torch.rand(30, 3, generator=generator)

@@ -75,7 +75,7 @@ def test_a_part_off_its_place_moves_the_estimate_as_its_sensitivity_says(person)
     known = KnownPerson(TRUTH, 0.04 * torch.eye(3), torch.zeros(3, person.num_parts))
 
     def fitted(data):
-        found = body.fit(known, OrientedScan(data, outward), pose, None)
+        found = body.fit(known, OrientedScan(data[None], outward[None]), pose, None)
         return found.known.coefficients, found.known.alone.sensitivity
 
     _, sensitivity = fitted(points)

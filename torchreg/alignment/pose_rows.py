@@ -140,24 +140,23 @@ class PoseRows:
         index = torch.arange(len(self.start), device=self.start.device)
         if config.search == "auto":
             index = needs_search(self.problem, self.start, found.found.pose).nonzero()[:, 0]
-        if len(index) == 0:
-            return found._trunk_turned()
-        rows, generator = found.rows(index), torch.Generator().manual_seed(config.seed)
-        explored = explore(
-            rows.problem, rows.start, rows.found.pose, candidates=config.num_candidates, rounds=config.search_rounds,
-            generator=generator,
-        )  # fmt: skip
-        return found._joined(index, rows._refitted(explored, on_step=rows.record))._trunk_turned()
+        if len(index):
+            rows, generator = found.rows(index), torch.Generator().manual_seed(config.seed)
+            explored = explore(
+                rows.problem, rows.start, rows.found.pose, candidates=config.num_candidates,
+                rounds=config.search_rounds, generator=generator,
+            )  # fmt: skip
+            found = found._joined(index, rows._refitted(explored, on_step=rows.record))
+        return found if found.lead is None else found._trunk_turned(found.lead)
 
-    def _trunk_turned(self) -> PoseRows:
-        """Return the rows of a search with the trunk turned on the limb that it hangs on, where that is better.
+    def _trunk_turned(self, lead: Tensor) -> PoseRows:
+        """Return the rows, found with a lead (B,), with the trunk turned on the limb it hangs on, where that is better.
 
         A base that is nearly square, or of which little is seen, stays in the minimum that it was registered in: such
         minima are rivals, unless the trunk looks alike in them.
         """
-        problem = self.problem
-        turns = trunk_turns(problem, self.found.pose)
-        if self.lead is None or turns.shape[1] == 0 or self.task.config.surface_steps == 0:
+        problem, turns = self.problem, trunk_turns(self.problem, self.found.pose)
+        if turns.shape[1] == 0 or self.task.config.surface_steps == 0:
             return self
         ranked = Candidates.ranked(problem, turns, score_candidates(problem, turns, INLIER_SHARE))
         some = torch.cat([self.found.pose.unsqueeze(1), ranked.poses[:, : ROWS.turned]], dim=1)
@@ -166,9 +165,9 @@ class PoseRows:
         points = problem.skin(found.poses)[:, :, trunk]
         off = problem.surface.distance(points.flatten(1, 2), found.poses[:, 0]).view_as(points[..., 0])
         differs = off.square().mean(-1).sqrt() > SEARCH_BUDGET.duplicate * problem.size
-        lead = torch.where(differs, found.costs, torch.inf).amin(1) - found.costs[:, 0]
+        rival = torch.where(differs, found.costs, torch.inf).amin(1) - found.costs[:, 0]
         rows = self._refitted(found.poses[:, 0], on_step=None)
-        return replace(rows, lead=torch.minimum(self.lead, lead))
+        return replace(rows, lead=torch.minimum(lead, rival))
 
     def finished(self) -> PoseRows:
         """Return the rows fitted without what a crop cuts off, and to the end where another step would still gain."""
@@ -187,8 +186,8 @@ class PoseRows:
         more = left._refitted(left.found.pose, on_step=left.record, if_better=False, steps=steps, widths=())
         return rows._joined(index, more)
 
-    def judged(self, error: SurfaceError | None = None, covariance: Tensor | None = None) -> AlignResult:
-        """Return the result, with what speaks against it; error and covariance (1, D, D) are those of a person."""
+    def judged(self, person: tuple[SurfaceError, Tensor] | None = None) -> AlignResult:
+        """Return the result, with what speaks against it; ``person`` is as in `judge`."""
         problem, pose, config, seen = self.problem, self.found.pose, self.task.config, self.task.seen
         rivals = None if self.rivals is None else _different(self, self.rivals)
         fitted = DataOnShape.of(self, problem.data, problem.valid)
@@ -198,12 +197,10 @@ class PoseRows:
         # What lies off the surface tells nothing of the pose, unless all does.
         told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
         degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=4)
-        judgement = judge(
-            self.uncropped, pose, self.lead, error, seen.frames, rivals, self.task.in_picture, covariance
-        )  # fmt: skip
+        judgement = judge(self.uncropped, pose, self.lead, person, seen.frames, rivals, self.task.in_picture)
         confidence = torch.where(degenerate, 0.0, judgement.confidence)
         converged = self.found.change <= config.pose_atol
-        converged = converged | judgement.converged if config.surface_steps or error is not None else converged
+        converged = converged | judgement.converged if config.surface_steps or person is not None else converged
         states = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
         result = AlignResult(
             pose=world,

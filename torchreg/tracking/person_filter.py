@@ -53,15 +53,21 @@ class KnownPerson:
 
 @dataclass(frozen=True, eq=False)
 class OrientedScan:
-    """Data (M, 3) of a frame and their normals (M, 3), zero where unknown."""
+    """Data (1, M, 3) of a frame and their normals (1, M, 3), zero where unknown."""
 
     data: Tensor
     normals: Tensor
 
     @classmethod
     def of(cls, data: Tensor, viewpoint: Tensor | None) -> OrientedScan:
-        """Return data with normals, which face the camera at a viewpoint (3,) where one is known."""
-        return cls(data, scan_normals(data, torch.ones_like(data[:, 0], dtype=torch.bool), viewpoint))
+        """Return data (M, 3) with normals, which face the camera at a viewpoint (3,) where one is known."""
+        normals = scan_normals(data, torch.ones_like(data[:, 0], dtype=torch.bool), viewpoint)
+        return cls(data[None], normals[None])
+
+    @property
+    def valid(self) -> Tensor:
+        """True everywhere."""
+        return torch.ones_like(self.data[..., 0], dtype=torch.bool)
 
 
 @dataclass(frozen=True)
@@ -164,7 +170,7 @@ class PersonFilter:
             state = torch.cat([moved[:, :6], inside[:, 6:]], dim=-1)
         rows, hessian, _ = self._normal_equations(*terms, scan, state)
         covariance = torch.linalg.inv(hessian + prior)
-        moves = rows.part_gradients(terms[0], scan.data[None], state)[0].double()
+        moves = rows.part_gradients(terms[0], scan.data, state)[0].double()
         sensitivity = covariance @ (prior @ sensitivity - moves)
         error = self._error(state, step, covariance)
         known = KnownPerson(state[0, dofs:], covariance.to(state), sensitivity.to(state))
@@ -206,10 +212,8 @@ class PersonFilter:
 
     def _terms(self, scan: OrientedScan) -> tuple[ShapedSurface, OutsideTerm | None]:
         """Return the surface for a scan, and what skin outside of it costs where it is closed."""
-        data, normals = scan.data[None], scan.normals[None]
-        surface = ShapedSurface(self._skin, normals, SURFACE_FIT.max_width * self._size)
-        valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-        outside = OutsideTerm.of_scans(self._model, data, valid, normals, self._size)
+        surface = ShapedSurface(self._skin, scan.normals, SURFACE_FIT.max_width * self._size)
+        outside = OutsideTerm.of_scans(self._model, scan.data, scan.valid, scan.normals, self._size)
         return surface, outside if bool(outside.weight.any()) else None
 
     def differs(self, first: Tensor, second: Tensor) -> bool:
@@ -222,8 +226,7 @@ class PersonFilter:
         self, surface: ShapedSurface, outside: OutsideTerm | None, scan: OrientedScan, state: Tensor
     ) -> tuple[RobustRows, Tensor, Tensor]:
         """Return the data's rows, and Gauss-Newton Hessian (D + K, D + K) and gradient (D + K,) of a frame, float64."""
-        data = scan.data[None]
-        rows = robust_rows(surface, data, torch.ones_like(data[..., 0], dtype=torch.bool), state, self._size)
+        rows = robust_rows(surface, scan.data, scan.valid, state, self._size)
         factor = (rows.weights.sqrt() / rows.noise.unsqueeze(-1))[0].double()
         jacobian = rows.jacobian[0].double() * factor.unsqueeze(-1)
         hessian, gradient = jacobian.mT @ jacobian, jacobian.mT @ (rows.distance[0].double() * factor)

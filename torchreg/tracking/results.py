@@ -186,6 +186,12 @@ class TrackState(Result):
         return KnownPerson(self.coefficients, self.person_covariance, self.person_sensitivity)
 
     @property
+    def known_coefficients(self) -> KnownPerson | None:
+        """What is known of coefficients, whatever the pose."""
+        known = self.known_person
+        return None if known is None else known.alone
+
+    @property
     def tracked(self) -> bool:
         """Whether a frame was ever fitted."""
         return self.num_inliers > 0

@@ -289,10 +289,10 @@ class Tracker:
 
     def _with_coefficients(self, result: FrameResult) -> FrameResult:
         """Return a frame's result with what is known of the body's coefficients."""
-        known = self._state.known_person
+        known = self._state.known_coefficients
         if self._person is None or known is None:
             return result
-        count, covariance = self._person.body_count, known.alone.total
+        count, covariance = self._person.body_count, known.total
         return replace(
             result, coefficients=known.coefficients[:count], coefficient_covariance=covariance[:count, :count]
         )
@@ -417,7 +417,7 @@ class Tracker:
         names = ["frame", "time", "interval", "origin", "person", "lost"]
         kept = {name: getattr(state, name) for name in names}
         first = initial_state(self._fitter.skin, torch.full_like(state.pose, torch.nan), self.config.seed)
-        return _with_person(replace(first, **kept), state.known_person and state.known_person.alone)
+        return _with_person(replace(first, **kept), state.known_coefficients)
 
     def _accept(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame with the best fit that was found, and the state after it."""
@@ -427,7 +427,7 @@ class Tracker:
         result = fitted_result(self._fitter, state, frame, fit, covariance)
         after, usable = self._state_after(state, frame, fit, observed), result.statuses[0].usable
         if fit.person is not None:
-            after = _with_person(after, fit.person.known if usable else state.known_person and state.known_person.alone)
+            after = _with_person(after, fit.person.known if usable else state.known_coefficients)
         return result, replace(after, sure=after.sure or usable)
 
     def _state_after(self, state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
@@ -457,7 +457,7 @@ class Tracker:
             status = Status.NOT_FOUND
         pose = self._fitter.predict(state, frame.elapsed)
         after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
-        after = _with_person(after, state.known_person and state.known_person.alone)
+        after = _with_person(after, state.known_coefficients)
         return predicted_result(self._fitter, state, frame, pose, status), after
 
 

@@ -203,20 +203,19 @@ def judge(
     problem: AlignProblem,
     pose: Tensor,
     lead: Tensor | None,
-    error: SurfaceError | None = None,
+    person: tuple[SurfaceError, Tensor] | None = None,
     frames: Sequence[DepthFrame] = (),
     rivals: Tensor | None = None,
     in_picture: bool = False,
-    covariance: Tensor | None = None,
 ) -> Judgement:
     """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`.
 
-    ``error`` and ``covariance`` are those of a fit with shape coefficients. ``in_picture``: whether the frames are
-    crops of whole pictures, which may show something else; a mask says what is there.
+    ``person``: the errors of the surface and the covariance (B, D, D) of a fit with shape coefficients. ``in_picture``:
+    whether the frames are crops of whole pictures, which may show something else; a mask says what is there.
     """
     picture = PictureEvidence.of(problem, pose, frames) if frames else None
     shape, calibration = problem.skin.shape, PICTURE_CALIBRATION if in_picture else CALIBRATION
-    if error is None or covariance is None:
+    if person is None:
         residuals = SurfaceResiduals.of(problem, pose)
         distance, spreads = residuals.distance, end_spreads(problem, pose, residuals)
         evidence = gather_evidence(problem, pose, distance, lead, spreads)
@@ -229,7 +228,8 @@ def judge(
         around = curvature(problem, pose, residuals)
         converged, covariance = around.converged, _with_far_poses(problem, pose, residuals, around)
     else:
-        distance, calibration = problem.surface.distance(problem.data, pose), SHAPE_CALIBRATION
+        (error, covariance), calibration = person, SHAPE_CALIBRATION
+        distance = problem.surface.distance(problem.data, pose)
         evidence = gather_evidence(problem, pose, distance, lead, torch.zeros_like(pose[:, :1]))
         evidence, converged = replace(evidence, unknown=error.unknown(problem.size)), error.converged
         loose = error.loose([limb for limb, _ in limb_points(problem.skin)], problem.size)

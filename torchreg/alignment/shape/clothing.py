@@ -195,11 +195,10 @@ def _bare(problem: ShapeProblem) -> ShapeProblem:
 
 def _prior_evidence(problem: ShapeProblem, state: Tensor) -> float:
     """Return the prior's density at states (T, D + K) times the posterior's volume of clothes, as a logarithm."""
-    posterior = noise_covariance(problem, problem.robust_rows(state))[
-        0, -CLOTH.num_modes :, -CLOTH.num_modes :
-    ].double()
-    precision = problem.prior.precision[..., -CLOTH.num_modes :].double()
-    volume = torch.linalg.slogdet(posterior).logabsdet + precision.log().sum()
+    worn = slice(-CLOTH.num_modes, None)
+    posterior = noise_covariance(problem, problem.robust_rows(state))[0].double()
+    precision = problem.prior.precision[..., worn].double()
+    volume = torch.linalg.slogdet(posterior[worn, worn]).logabsdet + precision.log().sum()
     return 0.5 * float(volume) - float(problem.prior.cost(state).sum())
 
 

@@ -86,9 +86,8 @@ class PersonRows:
 
     def searched_too(self) -> PersonRows:
         """Return the fitted rows that a network proposed together with those of people searched for in the one scan."""
-        return replace(
-            self._joined(PersonRows.of_scans(self.task, *self._scan, None, proposes=False)), is_proposed=False
-        )
+        rows = PersonRows.of_scans(self.task, *self._scan, None, proposes=False)
+        return replace(self._joined(rows), is_proposed=False)
 
     def _proposed_too(self) -> PersonRows:
         """Return the rows fitted from a start, and those that a network proposes for the data on which the best lies.
@@ -96,7 +95,7 @@ class PersonRows:
         A start may be turned half about, and the data of a flipped person are nearly as likely.
         """
         proposer = self.task.people or shipped_people(self.task.shape)
-        if proposer is None or self._searched or self.problem.scans > 1:
+        if proposer is None or self._searched or self.problem.scans > 1 or self.task.config.search == "never":
             return self
         best, task = self._best(), replace(self.task, start=None, people=proposer)
         rows = self._joined(PersonRows.of_scans(task, *self._scan, None))
@@ -166,7 +165,7 @@ class PersonRows:
     def restarted(self) -> PersonRows:
         """Return the row of the best person, one of whose limbs may be re-initialized where clusters are left over.
 
-        Beside a start, people that a network proposes are tried.
+        Beside a start, people that a network proposes for the same data are tried.
         """
         rows = self._proposed_too()
         return replace(rows, state=rows._restarted_limb() if self.problem.scans == 1 else self.state).best()
@@ -244,7 +243,7 @@ class PersonRows:
     def _clothed_where_likelier(self, bare: FoundPerson) -> FoundPerson:
         """Return a person in clothes where the data of the scan are likelier with them, else the bare one."""
         # Neighbors share no more of the residuals than a model of bare skin errs: nothing is left for clothes.
-        if bool(bare.fitted.shared <= SURFACE_FIT.min_noise(self.problem.size)):
+        if bool((bare.fitted.shared_noise <= SURFACE_FIT.min_noise(self.problem.size)).all()):
             return bare
         with torch.inference_mode(False), torch.no_grad():
             task = replace(self.task, shape=clothed_rig(self.task.shape), clothed=True)
@@ -299,7 +298,7 @@ class FoundPerson:
         found = StageResult(pose=rows.start, sigma=fitted.sigma, change=fitted.change)
         rows = replace(rows, found=found, lead=fitted.lead, history=self.history)
         result = normal_copy(replace(
-            rows.judged(fitted.error, fitted.covariance[:, :dofs, :dofs]),
+            rows.judged((fitted.error, fitted.covariance[:, :dofs, :dofs])),
             coefficients=coefficients,
             coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
             clothing_offset=fitted.clothing,

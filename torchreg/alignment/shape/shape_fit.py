@@ -44,8 +44,8 @@ class ShapeFit:
     num_kept: int = 2  # starts that are still fitted to the surface
     num_found: int = 8  # starts that a search without a given one hands on: sizes and turned people
     num_proposed: int = 4  # starts that a network hands on: front and back, or of two limbs either
-    same_data: float = 0.95  # of what a start's fit lies on, that is on what a network proposes, if both are one person
     num_found_kept: int = 3  # of those: the back of a person looks much like its front
+    same_data: float = 0.95  # of what a start's fit lies on, that is on what a network proposes, if both are one person
     coarse_data: int = 1000  # of each scan, by which starts are told apart
     fine_data: int = 1500  # of each scan, before all of them count
     surface_points: int = 2000  # samples of the surface
@@ -65,7 +65,7 @@ class FittedShape:
     """Poses (T, D) and coefficients (K,) of a fit, with covariances (T, D + K, D + K) in tangent coordinates.
 
     `state` (T, D + K) solves `problem` about the scans' means; `lead` (1,) is the cost by which the best different
-    state is worse in a search; `shared` (T,) is the deviation of errors that neighbors share, metres. `rig` has
+    state is worse in a search; `shared_noise` (T,) is that of errors which neighbors share, metres. `rig` has
     those of clothes as its last coefficients, where there may be any, lying off the skin by `clothing` (V,), metres.
     """
 
@@ -76,7 +76,7 @@ class FittedShape:
     sigma: Tensor
     change: Tensor
     error: SurfaceError
-    shared: Tensor
+    shared_noise: Tensor
     problem: ShapeProblem
     state: Tensor
     rig: ArticulatedShape
@@ -120,7 +120,7 @@ def fitted_shape(problem: ShapeProblem, before: Tensor, found: StageResult, shap
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
         error=_surface_error(problem, before, found.pose, covariance[:, :known, :known]),
-        shared=rows.shared,
+        shared_noise=rows.shared,
         problem=problem,
         state=found.pose,
         rig=shape,
