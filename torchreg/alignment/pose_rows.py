@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import warn_about_rounding
+from torchreg.alignment.evidence.confidence import explained_alone
 from torchreg.alignment.evidence.curvature import curvature
 from torchreg.alignment.evidence.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
@@ -161,13 +162,16 @@ class PoseRows:
         ranked = Candidates.ranked(problem, turns, score_candidates(problem, turns, INLIER_SHARE))
         some = torch.cat([self.found.pose.unsqueeze(1), ranked.poses[:, : ROWS.turned]], dim=1)
         found = Candidates.fitted(problem, some)
-        trunk = torch.isin(problem.skin.weights.argmax(-1), torch.tensor(find_limbs(problem.skin.shape)[1]))
-        points = problem.skin(found.poses)[:, :, trunk]
+        trunk = find_limbs(problem.skin.shape)[1]
+        own = torch.isin(problem.skin.weights.argmax(-1), torch.tensor(trunk))
+        points = problem.skin(found.poses)[:, :, own]
         off = problem.surface.distance(points.flatten(1, 2), found.poses[:, 0]).view_as(points[..., 0])
         differs = off.square().mean(-1).sqrt() > SEARCH_BUDGET.duplicate * problem.size
         rival = torch.where(differs, found.costs, torch.inf).amin(1) - found.costs[:, 0]
         rows = self._refitted(found.poses[:, 0], on_step=None)
-        return replace(rows, lead=torch.minimum(lead, rival))
+        # Few data tell of a trunk: a lead counts by these.
+        telling = explained_alone(problem, rows.found.pose, [trunk])[:, 0].clamp_min(1)
+        return replace(rows, lead=torch.minimum(lead, rival * (problem.valid.sum(-1) / telling).clamp_min(1)))
 
     def finished(self) -> PoseRows:
         """Return the rows fitted without what a crop cuts off, and to the end where another step would still gain."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -237,8 +238,11 @@ def _covariance(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals
 def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the number of data (B, L) that only one limb explains, for each limb; infinity without limbs."""
     limbs = [limb.parts for limb, _ in limb_points(problem.skin)]
-    explained, *by_rest = soft_inliers(
-        problem, problem.skin.shape.distances_without(problem.data, pose, [(), *limbs])
-    ).unbind(0)
-    counts = [(explained - rest).clamp_min(0).sum(-1) for rest in by_rest]
-    return torch.stack(counts, dim=-1) if counts else torch.full_like(explained[:, :1], torch.inf)
+    return explained_alone(problem, pose, limbs) if limbs else torch.full_like(pose[:, :1], torch.inf)
+
+
+def explained_alone(problem: AlignProblem, pose: Tensor, groups: Sequence[Sequence[int]]) -> Tensor:
+    """Return the number of data (B, L), softly counted, that only one of L groups of parts explains, for each."""
+    distances = problem.skin.shape.distances_without(problem.data, pose, [(), *groups])
+    explained, *by_rest = soft_inliers(problem, distances).unbind(0)
+    return torch.stack([(explained - rest).clamp_min(0).sum(-1) for rest in by_rest], dim=-1)
