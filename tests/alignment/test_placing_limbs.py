@@ -8,6 +8,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import TIPS, hinge, joint, off, problem_of, shape_of, solid
+from torchreg.alignment.evidence.confidence import explained_alone
 from torchreg.alignment.search.limb_search import trunk_turns
 from torchreg.geometry.rotation import so3_log
 
@@ -172,3 +173,15 @@ def test_a_trunk_with_several_limbs_or_known_does_not_turn(plain_hand):
     assert trunk_turns(replace(problem_on(shape, pose), prior_precision=told), pose).shape[1] == 0
     rest = plain_hand.rest_pose()[None]
     assert trunk_turns(problem_on(plain_hand, rest), rest).shape[1] == 0
+
+
+def test_few_data_tell_of_a_trunk_alone():
+    """Of samples of a surface its own count, but those beside another part; the whole is told by all."""
+    shape = shape_of(FREE_ARM, [block(0.1, 0.08, 0.03), rod(0.2), rod(0.2), rod(0.2)])
+    skin, pose = tr.sample_skin(shape, 600), shape.rest_pose()[None]
+    pose[:, 6:] = torch.tensor([0.3, -0.6, 0.9])
+    problem, part = problem_of(skin, skin(pose), pose), skin.weights.argmax(-1)
+    told = explained_alone(problem, pose, [(0,), (3,), (0, 1, 2, 3)])[0]
+    for count, number in zip(told[:2], (0, 3), strict=True):
+        assert 0.6 < float(count) / int((part == number).sum()) < 1.05
+    assert float(told[2]) == pytest.approx(600, rel=0.05)
