@@ -35,7 +35,11 @@ LAYERS = [
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 SYSTEMS = {"alignment", "tracking", "registration", "spines"}
 # One system that may import another, or one module that may.
-BRIDGES = {("tracking", "alignment"), ("alignment/skeleton_source.py", "spines")}
+BRIDGES = {
+    ("tracking", "alignment"),
+    ("alignment/skeleton_source.py", "spines"),
+    ("alignment/search/matched_poses.py", "registration"),
+}
 # Two rooms of one system that know nothing of each other.
 APART = {("registration/dense", "registration/bones"), ("registration/bones", "registration/dense")}
 

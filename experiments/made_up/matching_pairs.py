@@ -21,6 +21,7 @@ from torchreg.geometry.rotation import so3_exp
 
 from ..made_up.creature_kinds import TRAINING_KINDS, Kind
 from ..made_up.creature_parts import Draw
+from ..made_up.scans_in_company import TrueScan
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def matching_pairs(
     bodies: Callable[[Draw], tuple[str, PosableBody]] | None = None,
     body_share: float = 0.4,
     whole: float = 0.0,
+    rough: float = 0.0,
 ) -> Iterator[MatchingPair]:
     """Yield pairs of scans of creatures, each creature new at every few pairs, without end.
 
@@ -112,23 +114,27 @@ def matching_pairs(
         bodies: draws a further body, such as a rig of a user, and its kind; each is warped and scaled anew.
         body_share: of the pairs that show one of those.
         whole: of the pairs whose scans are of all sides, as complete meshes are.
+        rough: of the pairs whose target stands among other things, and of those whose scans are bare clouds; the source
+            has company in a third of as many.
 
     Cost: 0.3 s a pair.
     """
     draw = Draw(torch.Generator().manual_seed(seed))
     kinds = TRAINING_KINDS if kinds is None else kinds
     names, shares = list(kinds), [share for _, share in kinds.values()]
+    others: list[RangeScan] = []  # of the creature before
     while True:
         if bodies is not None and draw.chance(body_share):
             kind, body = bodies(draw)
         else:
             kind = names[int(torch.multinomial(torch.tensor(shares), 1, generator=draw.generator))]
             body = drawn_body(kinds[kind][0], draw)
-        body = _warped(body, draw)
+        body, before = _warped(body, draw), others
         for _ in range(_VARIETY.pairs_per_creature):
             pair = _pair(kind, body, draw, whole=whole > 0 and draw.chance(whole))
             if pair is not None:
-                yield pair
+                others = [pair.source, pair.target]
+                yield _roughened(pair, before, rough, draw) if rough > 0 else pair
 
 
 def drawn_body(kind: Kind, draw: Draw) -> PosableBody:
@@ -199,6 +205,20 @@ def _pair(kind: str, body: PosableBody, draw: Draw, *, whole: bool) -> MatchingP
         target_truth=target_truth,
         target_visible=target_visible,
     )
+
+
+def _roughened(pair: MatchingPair, others: list[RangeScan], rough: float, draw: Draw) -> MatchingPair:
+    """Return a pair with other things in it, and as bare clouds, by their chances."""
+    sides = []
+    for name, share in (("source", rough / 3), ("target", rough)):
+        other = others[draw.count(0, len(others) - 1)] if others else None
+        own = TrueScan(*(getattr(pair, name + end) for end in ("", "_truth", "_visible")))
+        sides.append(own.roughened(other, draw, company=share, cloud=rough))
+    source, target = sides
+    return replace(
+        pair, source=source.scan, source_truth=source.truth, source_visible=source.visible,
+        target=target.scan, target_truth=target.truth, target_visible=target.visible,
+    )  # fmt: skip
 
 
 def two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMesh]:

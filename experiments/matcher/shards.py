@@ -26,6 +26,8 @@ SHARD = 50
 _BODIES = 0.6
 # Share of the pairs that show all sides, as complete meshes do.
 _WHOLE = 0.25
+# Share of the pairs with other things in them, and of the scans that are bare clouds.
+_ROUGH = 0.35
 # Steps of a geodesic distance as it is stored, in one byte.
 _LEVELS = 255 / SIZES.farthest
 
@@ -138,7 +140,12 @@ def _stream(seed: int, held_out: bool, rigs: Path | None, people: int) -> Iterat
     drawn = drawn_people(Draw(torch.Generator().manual_seed(seed)), people) if people else []
     bodies = drawn_bodies(rigs, drawn, held_out=held_out)
     return matching_pairs(
-        seed, HELD_OUT_KINDS if held_out else TRAINING_KINDS, bodies=bodies, body_share=_BODIES, whole=_WHOLE
+        seed,
+        HELD_OUT_KINDS if held_out else TRAINING_KINDS,
+        bodies=bodies,
+        body_share=_BODIES,
+        whole=_WHOLE,
+        rough=_ROUGH,
     )
 
 

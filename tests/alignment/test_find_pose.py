@@ -249,7 +249,8 @@ def test_misfits_are_searched_for_again(find, two_clouds, two_hands, monkeypatch
     """A cloud whose first searches went wrong is saved by one with other draws; the other cloud is left alone."""
     searched = []
 
-    def fail_twice(problem, source, config, proposed):
+    def fail_twice(proposed, source, config):
+        problem = proposed.problem
         searched.append((config.seed, len(problem.data)))
         shift = torch.nn.functional.pad(two_clouds.mean(1), (0, 24))
         poses = (two_hands - shift)[-len(problem.data) :].unsqueeze(1).repeat(1, 2, 1)

@@ -30,7 +30,7 @@ from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, ali
 from torchreg.alignment.search.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.rough_poses import PoseSource, typical_poses
-from torchreg.alignment.search.start_source import StartSource
+from torchreg.alignment.search.start_source import Proposed, StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.far_origin import to_world
@@ -206,53 +206,48 @@ def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
 ) -> Candidates:
     """Return candidates (B, H): a network's, and a search's if in doubt."""
-    problem, proposed = source.proposed(problem, config.num_searched)
-    if proposed.shape[1] == 0:
-        return _search_with_retries(problem, source, config, proposed)
-    found = Candidates.fitted(problem, proposed)
-    uncropped = without_cut(problem, found.poses[:, 0], frames)
+    proposed = source.proposed(problem, config.num_searched)
+    if proposed.poses.shape[1] == 0:
+        return _search_with_retries(proposed, source, config)
+    found = Candidates.fitted(proposed.problem, proposed.poses)
+    uncropped = without_cut(proposed.window, found.poses[:, 0], frames)
     sure = explains(uncropped, found.poses[:, 0], found.lead()) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     count = min(config.num_searched, config.num_placed)
     poses, costs = found.poses[:, :1].repeat(1, count, 1), found.costs[:, :1].repeat(1, count)
     if len(rows):
-        searched = _search_with_retries(problem.rows(rows), source, config, found.poses[rows])
+        searched = _search_with_retries(replace(proposed, poses=found.poses).rows(rows), source, config)
         poses[rows], costs[rows] = searched.poses, searched.costs
-    return found.joined(Candidates(problem, poses, costs))
+    return found.joined(Candidates(proposed.problem, poses, costs))
 
 
-def _search_with_retries(
-    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
-) -> Candidates:
+def _search_with_retries(proposed: Proposed, source: StartSource, config: FindPoseConfig) -> Candidates:
     """Return candidates (B, H) after as many searches as each cloud needs."""
-    found = _search(problem, source, config, proposed)
+    found = _search(proposed, source, config)
     poses, costs = found.poses, found.costs
-    active = is_misfit(problem, poses[:, 0]).nonzero()[:, 0]
+    active = is_misfit(proposed.problem, poses[:, 0]).nonzero()[:, 0]
     for number in range(1, config.num_retries + 1):
         if len(active) == 0:
             break
-        part = problem.rows(active)
-        retried = _search(part, source, replace(config, seed=config.seed + number), proposed[active])
-        merged = Candidates(part, poses[active], costs[active]).joined(retried).take(slice(poses.shape[1]))
+        part = proposed.rows(active)
+        retried = _search(part, source, replace(config, seed=config.seed + number))
+        merged = Candidates(part.problem, poses[active], costs[active]).joined(retried).take(slice(poses.shape[1]))
         poses[active], costs[active] = merged.poses, merged.costs
-        active = active[is_misfit(part, poses[active, 0])]
-    return Candidates(problem, poses, costs)
+        active = active[is_misfit(part.problem, poses[active, 0])]
+    return Candidates(proposed.problem, poses, costs)
 
 
-def _search(problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor) -> Candidates:
+def _search(proposed: Proposed, source: StartSource, config: FindPoseConfig) -> Candidates:
     """Return candidates (B, H) after one search."""
-    generator = torch.Generator().manual_seed(config.seed)
+    problem, generator = proposed.problem, torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
-    rough = source.rough(search.problem, generator)
-    ranked = search.registered(rough, generator)
+    ranked = search.registered(source.rough(proposed.window, generator), generator)
     if isinstance(problem.surface, SkinSurface):
-        rough = torch.cat([proposed, ranked.distinct(SEARCH_BUDGET.same, config.num_placed).poses], dim=1)
-        aligned = align_rows(problem, rough, config.num_searched, generator)
-        return Candidates.fitted(problem, aligned)
+        rough = ranked.distinct(SEARCH_BUDGET.same, config.num_placed).poses
+        return Candidates.fitted(problem, align_rows(problem, rough, config.num_searched, generator))
     rough = ranked.distinct(SEARCH_BUDGET.same, config.num_candidates).poses
-    pool = search.fit_coarsely(rough)[:, : config.num_placed]
-    pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
+    pool = torch.cat([proposed.poses, search.fit_coarsely(rough)], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
     return Candidates.fitted(problem, poses)
 

@@ -124,7 +124,7 @@ class Recovery:
             self.fitter.skin, data[None], valid, state.pose[None], origin[None], prior_std=FindPoseConfig.prior_std,
             pose_atol=0.0,
         )  # fmt: skip
-        _, poses = self.source.proposed(problem, FindPoseConfig.num_searched)
+        poses = self.source.proposed(problem, FindPoseConfig.num_searched).poses
         fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0].unique(dim=0)]
         return max((fit for fit in fits if fit is not None), key=lambda fit: fit.soft_inliers, default=None)
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem
+from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
+from torchreg.alignment.fit.problem import INLIER_SHARE, AlignProblem, errors_per_patch, soft_inliers
 from torchreg.geometry.budget import BUDGET
 
 
@@ -19,6 +20,7 @@ class _Rays:
     facing: float = 0.3  # cosine between a normal and the direction to the camera of a visible surface, at least
     nearest: float = 0.04  # first step towards the camera in which the shape may hide itself; each is twice as long
     count: int = 5
+    sure: float = 2.0  # standard deviations to the bound of the share of the surface without data
     num_data: int = 1000  # per cloud, that tell how much of the surface has data: more tell the same
 
 
@@ -56,6 +58,24 @@ def unseen_share(
     bare = visible & (apart > 2 * INLIER_SHARE * problem.size)
     share = bare.sum(-1) / visible.sum(-1).clamp_min(1)
     return torch.where(visible.any(-1) & near.any(-1), share, 1.0).to(pose)
+
+
+def missing_data(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return how many more data (B,) there would surely be if all the surface that a camera sees had them as densely.
+
+    What a pose explains beside other things, or of something else, it does not cover; a picture tells that better. The
+    share without data is a lower bound (Wilson 1927), of which patches of the surface tell independently.
+    """
+    if problem.factor(FreeSpaceTerm) is not None:
+        return torch.zeros_like(pose[:, 0])
+    distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+    near = soft_inliers(problem, distance)
+    count, share = near.sum(-1), unseen_share(problem, pose, distance, jacobian)
+    patches = count / errors_per_patch(problem.data, near > 0.5, problem.size)
+    prior = _RAYS.sure**2 / patches.clamp_min(1)
+    spread = (prior * (share * (1 - share) + prior / 4)).sqrt()
+    surely = ((share + prior / 2 - spread) / (1 + prior)).clamp(0, 1 - 1 / len(problem.skin))
+    return count * surely / (1 - surely)
 
 
 def _normals(jacobian: Tensor) -> Tensor:

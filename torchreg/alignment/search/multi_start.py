@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.coverage import missing_data
 from torchreg.alignment.fit.annealed_em import ANNEALING, anneal, narrowing
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, alignment_cost
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface, surface_steps
@@ -69,7 +70,7 @@ class Candidates:
         def fit(part: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
             steps, widths = SURFACE_FIT.search_steps, SURFACE_FIT.widths[-1:]
             fitted = fit_surface(part, pose, steps=steps, widths=widths).pose
-            return fitted, alignment_cost(part, fitted)
+            return fitted, candidate_cost(part, fitted)
 
         return cls.ranked(problem, *_few_at_a_time(fit, problem, poses))
 
@@ -133,6 +134,11 @@ def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tens
     return scores + problem.factor_score(poses, width)
 
 
+def candidate_cost(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the cost (B,) that ranks fitted candidates: of data that they leave unexplained, or that they miss."""
+    return alignment_cost(problem, pose) + missing_data(problem, pose)
+
+
 def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return the best ``count`` of candidates (B, K, num_dofs) after an alignment of all their joints to few data.
 
@@ -147,7 +153,7 @@ def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torc
         part, pose = drawn.rows(rows).repeated(candidates), poses[rows].flatten(0, 1)
         pose = anneal(part, pose, schedule, em_steps=settings.em_steps, m_steps=settings.m_steps).pose
         pose = fit_surface(part, pose, steps=settings.surface_steps).pose
-        costs = alignment_cost(part, pose).unflatten(0, (-1, candidates))
+        costs = candidate_cost(part, pose).unflatten(0, (-1, candidates))
         ranked = Candidates.ranked(drawn.rows(rows), pose.unflatten(0, (-1, candidates)), costs)
         found.append(ranked.distinct(SEARCH_BUDGET.same, count).poses)
     return torch.cat(found)

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from torchreg.alignment.fit.annealed_em import ANNEALING
-from torchreg.alignment.fit.objectives import GaussianPosePrior, registration_objective
+from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import AlignProblem, joint_precision
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, take_rows
+from torchreg.alignment.search.matched_poses import PROPOSAL_FIT, can_be_matched, matched_pose, matched_poses
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan
 from torchreg.alignment.search.pose_proposer import (
     HoldsProposer,
     PoseProposer,
@@ -26,21 +25,7 @@ from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, PoseSource, U
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.solvers.e_step import EStep
 
-
-@dataclass(frozen=True)
-class _Fit:
-    """Numbers of the fit; widths are shares of the model's size."""
-
-    kept: int = 2  # most probable proposals where there is no time for all, beside that fitted to matches
-    surface_std: float = 0.015  # of where the network says that a datum lies on the shape
-    reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
-    joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
-    matched_steps: int = 2  # in each round
-
-
-PROPOSAL_FIT = _Fit()
 # From what a proposal errs by to a searched pose's width.
 _PLAN = Plan(start=0.05, stop=0.02, steps=2)
 
@@ -71,30 +56,17 @@ def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignPro
     return replace(problem, prior=replace(prior, mean=mean, precision=precision))
 
 
-def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
-    """Return poses (B, num_dofs) after an EM that matches data to model points near their places at rest.
+@dataclass(frozen=True, eq=False)
+class Proposed:
+    """Proposed poses (B, K, num_dofs), K zero for none, a problem with them as its prior, and one of the data there."""
 
-    Pairs of a datum and a model point that rounding cannot tell from none are left out: few are near each other.
-    """
-    skin, sigma, pose = problem.skin, ANNEALING.stop * problem.size, problem.prior.mean
-    near = torch.cdist(proposals.surface, skin.points).square()
-    share = (near / (-2 * (PROPOSAL_FIT.surface_std * problem.size) ** 2)).softmax(-1)
-    share, index = share.topk(int((share > torch.finfo(share.dtype).eps).sum(-1).max()), sorted=False)
-    told, index, points = share * proposals.inlier.unsqueeze(-1), index.flatten(1), proposals.points.unsqueeze(2)
-    for width in (None, *PROPOSAL_FIT.reach):
-        weight = told
-        if width is not None:
-            far = (points - take_rows(skin(pose), index).unflatten(1, told.shape[1:])).square().sum(-1)
-            weight = told * (far * (-0.5 / (width * problem.size) ** 2)).exp()
-        each = (weight.unsqueeze(-1) * pad(points, (0, 1), value=1.0)).flatten(1, 2)
-        sums = each.new_zeros(len(pose), len(skin), 4).scatter_add(1, index.unsqueeze(-1).expand_as(each), each)
-        total = sums[..., 3]
-        targets = sums[..., :3] / total.clamp_min(1e-9).unsqueeze(-1)
-        matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
-        objective = registration_objective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
-        for _ in range(PROPOSAL_FIT.matched_steps):
-            pose = problem.step(objective(pose), pose).state
-    return pose
+    problem: AlignProblem
+    window: AlignProblem
+    poses: Tensor
+
+    def rows(self, index: Tensor) -> Proposed:
+        """Return some rows of the batch."""
+        return Proposed(self.problem.rows(index), self.window.rows(index), self.poses[index])
 
 
 @dataclass(frozen=True)
@@ -131,14 +103,18 @@ class StartSource:
         """Return rough poses (B, K, num_dofs) of all sources."""
         return self._substituted(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
 
-    def proposed(self, problem: AlignProblem, count: int) -> tuple[AlignProblem, Tensor]:
-        """Return the problem with the network's pose as the prior, and its fitted poses (B, count, num_dofs)."""
-        if self.proposer is None:
-            return problem, problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
-        proposals = self.proposer.propose(problem.data, problem.valid)
-        problem = with_proposed_prior(problem, proposals)
-        found = fitted_proposals(problem, proposals).distinct(SEARCH_BUDGET.same, count).poses
-        return problem, self._substituted(problem, found)
+    def proposed(self, problem: AlignProblem, count: int) -> Proposed:
+        """Return what a network for the shape proposes, or the matcher of scans where a file has its surface."""
+        none = problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
+        if self.proposer is not None:
+            proposals = self.proposer.propose(problem.data, problem.valid)
+            problem = with_proposed_prior(problem, proposals)
+            found = fitted_proposals(problem, proposals).distinct(SEARCH_BUDGET.same, count).poses
+            return Proposed(problem, problem, self._substituted(problem, found))
+        if self.sources is not DEFAULT_SOURCES or not can_be_matched(problem):
+            return Proposed(problem, problem, none)
+        window, poses = matched_poses(problem, count)
+        return Proposed(problem, replace(problem, valid=window), self._substituted(problem, poses))
 
     def _substituted(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchreg.geometry.neighbors import k_nearest
 from torchreg.registration.dense.oriented_samples import OrientedSamples
-from torchreg.registration.dense.scan_matcher import ScanMatcher
+from torchreg.registration.dense.scan_matcher import shared_matcher
 from torchreg.registration.dense.scan_tokens import ScanTokens
 
 # Tokens about each sample between which it lies, and how much nearer the nearest one counts: about their spacing.
@@ -48,7 +48,7 @@ class MatchPrior:
     def of_samples(cls, source: OrientedSamples, target: OrientedSamples, count: int) -> MatchPrior:
         """Return what the matcher of torchreg says of samples, the first ``count`` of the source alone."""
         tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (source, target))
-        logits = _matcher()(*tokens)[0].to(source.points)
+        logits = shared_matcher()(*tokens)[0].to(source.points)
         return cls.of_logits(logits, source.points[:count], target.points)
 
     @cached_property
@@ -90,13 +90,6 @@ class MatchPrior:
         # A sure match of samples between tokens has the share of one token.
         support = _ABOUT * (chances[rows, about[index]] * weight[index]).sum(-1)
         return ((support + doubt) / (1 + doubt)).log()
-
-
-@cache
-def _matcher() -> ScanMatcher:
-    # Layers draw weights before those of the file replace them: the caller's random state stays.
-    with torch.random.fork_rng(devices=[]):
-        return ScanMatcher().requires_grad_(False)
 
 
 def _folded(table: Tensor, count: int) -> Tensor:

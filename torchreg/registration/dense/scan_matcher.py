@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -215,3 +216,11 @@ def _relations(points: Tensor, normals: Tensor, geodesic: Tensor) -> Tensor:
 
 def _pretrained_state() -> dict[str, Tensor]:
     return {name: value.float() for name, value in load_tensors(WEIGHTS)[0].items()}
+
+
+@cache
+def shared_matcher() -> ScanMatcher:
+    """Return the same matcher with the weights that come with torchreg, read once."""
+    # Layers draw weights before those of the file replace them: the caller's random state stays.
+    with torch.random.fork_rng(devices=[]):
+        return ScanMatcher().requires_grad_(False)
