@@ -15,12 +15,12 @@ from torchreg.alignment.fit.objectives import registration_objective
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.search.multi_start import align_rows, take_rows
 from torchreg.alignment.search.pose_proposer import Proposals
+from torchreg.alignment.search.windows import DataWindows
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
-from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.visibility import sample_visible
 from torchreg.registration.dense.scan_matcher import match_probabilities, shared_matcher
 from torchreg.registration.dense.scan_tokens import ScanTokens
@@ -36,12 +36,6 @@ class _Matching:
 
     camera: float = 3.0  # its distance from the middle of the surface at rest
     samples: int = 2000  # points of a view
-    window: float = 0.55  # radius of what is looked at at once: the shape, in any pose
-    centers: int = 8  # of windows, at most
-    moved: int = 2  # times a center is moved to the mean of what is around it
-    same: float = 0.2  # windows nearer than this are one
-    inside: float = 0.95  # share of the data in a first window with which there are no others
-    least: int = 60  # data in a window
     fitted_windows: int = 2  # those with the best matches
     fitted_views: int = 3  # in each, beside the best match of each datum in all views
     fitted: int = 8  # poses of all these
@@ -74,23 +68,22 @@ def can_be_matched(problem: AlignProblem) -> bool:
     return free and problem.skin.shape.surface is not None
 
 
-def matched_poses(problem: AlignProblem, count: int) -> tuple[Tensor, Tensor]:
-    """Return aligned poses (B, count, num_dofs) by matches of the surface in windows of data, which may show much else.
-
-    The mask (B, M) is that of the data in the window that matches best.
-    """
+def matched_poses(windows: DataWindows, problem: AlignProblem, count: int) -> tuple[Tensor, Tensor]:
+    """Return aligned poses (B, count, num_dofs) by matches of the surface and the data, and the best windows (B,)."""
     views, places = _views(problem.skin.shape)
-    found, valid = [], []
+    matches = [
+        _matches(points[valid], views, places)
+        for points, valid in zip(windows.problem.data, windows.problem.valid, strict=True)
+    ]
+    support, found = torch.stack([match.support.max() for match in matches]), []
     for row in range(len(problem.data)):
-        windows = _windows(problem.data[row], problem.valid[row], problem.size)
-        matches = [_matches(problem.data[row, window], views, places) for window in windows]
-        order = sorted(range(len(matches)), key=lambda index: -float(matches[index].support.max()))
-        several = [one for index in order[: _MATCHING.fitted_windows] for one in matches[index].ranked()]
+        own = (windows.row == row).nonzero()[:, 0]
+        best = own[support[own].argsort(descending=True)[: _MATCHING.fitted_windows]]
+        several = [one for window in best.tolist() for one in matches[window].ranked()]
         poses = _poses(problem.rows(torch.tensor([row])), several)
         found.append(poses[torch.arange(_MATCHING.fitted) % len(poses)])
-        valid.append(windows[order[0]])
     poses = align_rows(problem, torch.stack(found), count, torch.Generator().manual_seed(0))
-    return torch.stack(valid), poses
+    return poses, windows.best(-support)
 
 
 def _poses(problem: AlignProblem, matches: list[_Matches]) -> Tensor:
@@ -139,24 +132,6 @@ def _matches(data: Tensor, views: ScanTokens, places: Tensor) -> _Matches:
     probability = match_probabilities(shared_matcher()(several, views))[0]
     weight, index = probability.max(-1)
     return _Matches(data[scan.token_index[0]], places.gather(1, index.unsqueeze(-1).expand(*index.shape, 3)), weight)
-
-
-def _windows(data: Tensor, valid: Tensor, size: float) -> list[Tensor]:
-    """Return the masks (M,) of data (M, 3) in each window: of all where they fit in one."""
-    points, radius = data[valid], _MATCHING.window * size
-
-    def around(center: Tensor) -> Tensor:
-        return ((data - center).norm(dim=-1) < radius) & valid
-
-    if float(around(points.median(0).values).sum() / valid.sum()) > _MATCHING.inside:
-        return [valid]
-    centers: list[Tensor] = []
-    for center in points[farthest_points(points, min(_MATCHING.centers, len(points)))]:
-        for _ in range(_MATCHING.moved):
-            center = data[around(center)].mean(0)
-        if all(float((center - other).norm()) > _MATCHING.same * size for other in centers):
-            centers.append(center)
-    return [window for window in map(around, centers) if int(window.sum()) >= _MATCHING.least] or [valid]
 
 
 def _registered(shape: Articulation, points: Tensor, places: Tensor, weight: Tensor, size: float) -> Tensor:

@@ -12,7 +12,7 @@ from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import AlignProblem, joint_precision
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.search.matched_poses import PROPOSAL_FIT, can_be_matched, matched_pose, matched_poses
-from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, candidate_cost
 from torchreg.alignment.search.pose_proposer import (
     HoldsProposer,
     PoseProposer,
@@ -22,6 +22,7 @@ from torchreg.alignment.search.pose_proposer import (
 )
 from torchreg.alignment.search.pose_search import PoseSearch
 from torchreg.alignment.search.rough_poses import DEFAULT_SOURCES, PoseSource, UprightRotations
+from torchreg.alignment.search.windows import DataWindows
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
@@ -105,16 +106,21 @@ class StartSource:
 
     def proposed(self, problem: AlignProblem, count: int) -> Proposed:
         """Return what a network for the shape proposes, or the matcher of scans where a file has its surface."""
-        none = problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
-        if self.proposer is not None:
-            proposals = self.proposer.propose(problem.data, problem.valid)
-            problem = with_proposed_prior(problem, proposals)
-            found = fitted_proposals(problem, proposals).distinct(SEARCH_BUDGET.same, count).poses
-            return Proposed(problem, problem, self._substituted(problem, found))
-        if self.sources is not DEFAULT_SOURCES or not can_be_matched(problem):
-            return Proposed(problem, problem, none)
-        window, poses = matched_poses(problem, count)
-        return Proposed(problem, replace(problem, valid=window), self._substituted(problem, poses))
+        if self.proposer is None and (self.sources is not DEFAULT_SOURCES or not can_be_matched(problem)):
+            return Proposed(
+                problem, problem, problem.prior.mean.new_zeros(len(problem.data), 0, len(problem.skin.shape.rest))
+            )
+        windows = DataWindows.of(problem)
+        if self.proposer is None:
+            poses, best = matched_poses(windows, problem, count)
+        else:
+            proposals = self.proposer.propose(windows.problem.data, windows.problem.valid)
+            wide = with_proposed_prior(windows.problem, proposals)
+            found = fitted_proposals(wide, proposals).distinct(SEARCH_BUDGET.same, count)
+            inside = wide.valid.sum(-1)
+            best = windows.best(candidate_cost(wide, found.poses[:, 0]) - inside)
+            poses, problem = found.poses[best], replace(problem, prior=wide.rows(best).prior)
+        return Proposed(problem, windows.problem.rows(best), self._substituted(problem, poses))
 
     def _substituted(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(

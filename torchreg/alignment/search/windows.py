@@ -1,0 +1,72 @@
+"""Windows of the data about as large as a shape, which may be one thing among others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
+from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.geometry.sampling import farthest_points
+
+
+@dataclass(frozen=True)
+class _Windowing:
+    """Numbers of windows; lengths are shares of the shape's size."""
+
+    radius: float = 0.55  # the shape fits in, in any pose
+    centers: int = 8  # at most
+    moves: int = 2  # of a center to the mean of what is around it
+    same: float = 0.2  # windows nearer than this are one
+    inside: float = 0.95  # share of the data in a first window with which there are no others
+    least: int = 60  # data in a window
+
+
+_WINDOWING = _Windowing()
+
+
+@dataclass(frozen=True, eq=False)
+class DataWindows:
+    """Windows of the data of B problems: the problem (W rows) of each, and of which problem it is, (W,)."""
+
+    problem: AlignProblem
+    row: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem) -> DataWindows:
+        """Return the windows of a batch: one where the data fit in it, and in crops of pictures."""
+        whole = problem.factor(FreeSpaceTerm) is not None
+        masks = [
+            [valid] if whole else _windows(points, valid, problem.size)
+            for points, valid in zip(problem.data, problem.valid, strict=True)
+        ]
+        row = torch.arange(len(masks)).repeat_interleave(torch.tensor([len(several) for several in masks]))
+        valid = torch.stack([mask for several in masks for mask in several])
+        return cls(replace(problem.rows(row.to(valid.device)), valid=valid), row)
+
+    def best(self, costs: Tensor) -> Tensor:
+        """Return the window (B,) of each problem with the least cost (W,)."""
+        table = costs.new_full((int(self.row.max()) + 1, len(self.row)), torch.inf)
+        number = torch.arange(len(self.row))
+        table[self.row, number] = costs
+        return table.argmin(1)
+
+
+def _windows(data: Tensor, valid: Tensor, size: float) -> list[Tensor]:
+    """Return the masks (M,) of data (M, 3) in each window: of all where they fit in one."""
+    points, radius = data[valid], _WINDOWING.radius * size
+
+    def around(center: Tensor) -> Tensor:
+        return ((data - center).norm(dim=-1) < radius) & valid
+
+    if len(points) == 0 or float(around(points.median(0).values).sum() / len(points)) > _WINDOWING.inside:
+        return [valid]
+    centers: list[Tensor] = []
+    for center in points[farthest_points(points, min(_WINDOWING.centers, len(points)))]:
+        for _ in range(_WINDOWING.moves):
+            center = data[around(center)].mean(0)
+        if all(float((center - other).norm()) > _WINDOWING.same * size for other in centers):
+            centers.append(center)
+    return [window for window in map(around, centers) if int(window.sum()) >= _WINDOWING.least] or [valid]
