@@ -15,6 +15,7 @@ from torchreg.alignment.fit.implicit_gradient import FixedPoint, attach_gradient
 from torchreg.alignment.fit.objectives import GaussianPosePrior
 from torchreg.alignment.fit.problem import joint_precision, masked_mean, model_size
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
+from torchreg.alignment.search.windows import DataWindows
 from torchreg.alignment.shape.clothing import ClothedSpace
 from torchreg.alignment.shape.outside_term import OutsideTerm
 from torchreg.alignment.shape.person_proposer import PersonProposer
@@ -167,7 +168,11 @@ def shape_problem(
         problem, start = shape_problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
         one = problem.rows(torch.zeros(1, dtype=torch.int64)).draw(SHAPE_FIT.coarse_data, generator)
         if proposer is not None:
-            states = proposer.propose(one, shape.file_surface(), SHAPE_FIT.num_proposed, generator, config.upright)
+            surface, each = shape.file_surface(), DataWindows.of(one).problem
+            states = torch.cat([
+                proposer.propose(each.rows(torch.tensor([row])), surface, SHAPE_FIT.num_proposed, generator, config.upright)
+                for row in range(len(each.data))
+            ])  # fmt: skip
         else:
             people = start[:, shape.num_dofs :]
             states = find_people(one, shape, people, SHAPE_FIT.num_found, generator, config.upright)
