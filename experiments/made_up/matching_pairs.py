@@ -214,11 +214,19 @@ def _roughened(pair: MatchingPair, others: list[RangeScan], rough: float, draw: 
         other = others[draw.count(0, len(others) - 1)] if others else None
         own = TrueScan(*(getattr(pair, name + end) for end in ("", "_truth", "_visible")))
         sides.append(own.roughened(other, draw, company=share, cloud=rough))
-    source, target = sides
+    # Of what one scan shows a window of the other may have cut some off.
+    source, target = (
+        replace(mine, visible=mine.visible & _near(mine.truth, theirs.scan)) for mine, theirs in (sides, sides[::-1])
+    )
     return replace(
         pair, source=source.scan, source_truth=source.truth, source_visible=source.visible,
         target=target.scan, target_truth=target.truth, target_visible=target.visible,
     )  # fmt: skip
+
+
+def _near(places: Tensor, scan: RangeScan) -> Tensor:
+    """Return which places (N, 3) a scan has points next to."""
+    return NeighborTree(scan.points.double()).nearest(places.double())[1] < _VARIETY.visible * scan.diagonal
 
 
 def two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMesh]:

@@ -220,6 +220,24 @@ def test_the_truth_of_pairs_lies_on_the_other_scan_where_it_is_visible_and_leads
         assert float(back.median()) < 0.02 * pair.source.diagonal
 
 
+def test_pairs_among_other_things_keep_their_truth_and_hide_the_rest():
+    """Beside distances to the other scan: what is visible lies on it; nothing else of a scan does."""
+    plain, rough = matching_pairs(3), matching_pairs(3, rough=0.9)
+    sizes, hidden = [], []
+    for pair in itertools.islice(rough, 8):
+        for truth, visible, scan in (
+            (pair.source_truth, pair.source_visible, pair.target),
+            (pair.target_truth, pair.target_visible, pair.source),
+        ):
+            assert float((torch.cdist(truth[visible], scan.points).amin(1) / scan.diagonal).max()) <= 0.03
+        assert len(pair.target_truth) == len(pair.target) == len(pair.target_visible)
+        sizes.append(len(pair.target))
+        hidden.append(float((~pair.target_visible).double().mean()))
+    assert min(sizes) < 1600
+    assert max(hidden) > 0.2
+    assert {pair.kind for pair in itertools.islice(plain, 1)} == {next(matching_pairs(3, rough=0.9)).kind}
+
+
 def test_pairs_show_bodies_of_ones_own():
     limits = torch.tensor(TRAINING_KINDS["snake"][0](Draw(seeded(1))).limits, dtype=torch.float64)
     mine = ("mine", PosableBody(creature("snake"), limits))

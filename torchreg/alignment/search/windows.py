@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,15 +28,18 @@ class _Windowing:
 _WINDOWING = _Windowing()
 
 
+Problem = TypeVar("Problem", bound=AlignProblem)
+
+
 @dataclass(frozen=True, eq=False)
-class DataWindows:
+class DataWindows(Generic[Problem]):
     """Windows of the data of B problems: the problem (W rows) of each, and of which problem it is, (W,)."""
 
-    problem: AlignProblem
+    problem: Problem
     row: Tensor
 
     @classmethod
-    def of(cls, problem: AlignProblem) -> DataWindows:
+    def of(cls, problem: Problem) -> DataWindows[Problem]:
         """Return the windows of a batch: one where the data fit in it, and in crops of pictures."""
         whole = problem.factor(FreeSpaceTerm) is not None
         masks = [

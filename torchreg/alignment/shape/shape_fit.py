@@ -168,11 +168,10 @@ def shape_problem(
         problem, start = shape_problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
         one = problem.rows(torch.zeros(1, dtype=torch.int64)).draw(SHAPE_FIT.coarse_data, generator)
         if proposer is not None:
-            surface, each = shape.file_surface(), DataWindows.of(one).problem
-            states = torch.cat([
-                proposer.propose(each.rows(torch.tensor([row])), surface, SHAPE_FIT.num_proposed, generator, config.upright)
-                for row in range(len(each.data))
-            ])  # fmt: skip
+            windows = DataWindows.of(one).problem
+            rows = torch.arange(len(windows.data)).unsqueeze(1)
+            told = (shape.file_surface(), SHAPE_FIT.num_proposed, generator, config.upright)
+            states = torch.cat([proposer.propose(windows.rows(row), *told) for row in rows])
         else:
             people = start[:, shape.num_dofs :]
             states = find_people(one, shape, people, SHAPE_FIT.num_found, generator, config.upright)
