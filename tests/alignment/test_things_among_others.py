@@ -1,5 +1,7 @@
 """A thing among other things: windows of the data, poses by matches in them, and data that a candidate misses."""
 
+import copy
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -100,3 +102,28 @@ def test_searches_leave_the_random_state_alone_and_repeat(beast):
     first, second = (tr.find_pose(beast, data, config=config).best for _ in range(2))
     assert torch.equal(torch.random.get_rng_state(), before)
     assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("data", [torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]).repeat(50, 1)])
+def test_data_at_a_place_or_two_are_no_error(beast, data):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", tr.errors.DegenerateDataWarning)
+        found = tr.find_pose(beast, data)
+    assert bool(found.poses.isfinite().all())
+    assert float(found.confidence) < 0.05
+
+
+def test_a_batch_of_clouds_with_padding_is_a_loop_in_either_precision(beast):
+    config = replace(tr.FindPoseConfig(), num_placed=2, num_searched=1)
+    cloud = cloud_of(beast, beast.rest_pose(), 5)[:300]
+    both, mask = torch.stack([cloud, cloud + 1.0]), torch.ones(2, 300, dtype=torch.bool)
+    mask[1, 250:] = False
+    batch = tr.find_pose(beast, both, mask=mask, config=config).best
+    alone = torch.stack(
+        [tr.find_pose(beast, data[told], config=config).best for data, told in zip(both, mask, strict=True)]
+    )
+    torch.testing.assert_close(batch, alone, rtol=0, atol=1e-4)
+    double = tr.find_pose(copy.deepcopy(beast).double(), both.double(), mask=mask, config=config).best
+    assert double.dtype == torch.float64
+    off = surface_skin(beast)(double.float()) - surface_skin(beast)(batch)
+    assert float(off.norm(dim=-1).mean()) < 0.02

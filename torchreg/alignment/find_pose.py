@@ -97,10 +97,13 @@ def find_pose(
 ) -> PoseStarts:
     """Return the poses in which an articulated shape may lie on 3-D data, best first, and the confidence in the first.
 
-    Where a network proposes poses of the shape, these are fitted first. Without one, or where the best of them is
+    Where a network proposes poses of the shape, these are fitted first; of other shapes with a mesh, poses to which the
+    matches of a `ScanMatcher` lead, between the mesh at rest and the data. Both look into windows as large as the shape
+    where the data are larger, as they may show other things. Where nothing is proposed, or the best is
     doubtful, rough poses from all sources are registered rigidly in one batch; the best are fitted to the surface, and
     their limbs placed on the data by beam search, first coarsely, then thoroughly. A skinned rig's are aligned by
-    annealed EM instead. All are ranked by the data that they leave unexplained.
+    annealed EM instead. All are ranked by the data that they leave unexplained, and
+    those that are missing on the surface that a camera would see.
 
     Args:
         shape: the articulated shape, in metres; where its base is bolted down, only its joints are sought.

@@ -72,7 +72,7 @@ def matched_poses(windows: DataWindows, problem: AlignProblem, count: int) -> tu
     """Return aligned poses (B, count, num_dofs) by matches of the surface and the data, and the best windows (B,)."""
     views, places = _views(problem.skin.shape)
     matches = [
-        _matches(points[valid], views, places)
+        _matches(points[valid], views, places.to(points))
         for points, valid in zip(windows.problem.data, windows.problem.valid, strict=True)
     ]
     support, found = torch.stack([match.support.max() for match in matches]), []
@@ -126,11 +126,14 @@ def _relative(weight: Tensor) -> Tensor:
 
 
 def _matches(data: Tensor, views: ScanTokens, places: Tensor) -> _Matches:
-    """Return what the matcher says of data (M, 3) in one window."""
-    scan = ScanTokens.from_scan(RangeScan(data.double()))
+    """Return what the matcher says of data (M, 3) in one window; nothing where they lie at a place or two."""
+    try:
+        scan = ScanTokens.from_scan(RangeScan(data.double()))
+    except InputError:
+        repeated = data[torch.arange(places.shape[1]) % len(data)]
+        return _Matches(repeated, places, torch.zeros_like(places[..., 0]))
     several = ScanTokens.stack([scan] * len(views))
-    probability = match_probabilities(shared_matcher()(several, views))[0]
-    weight, index = probability.max(-1)
+    weight, index = match_probabilities(shared_matcher()(several, views))[0].to(data).max(-1)
     return _Matches(data[scan.token_index[0]], places.gather(1, index.unsqueeze(-1).expand(*index.shape, 3)), weight)
 
 
