@@ -14,7 +14,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
-from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, centered_problem, masked_mean
+from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, alignment_cost, centered_problem, masked_mean
 from torchreg.alignment.inputs import (
     Task,
     check_clouds,
@@ -185,7 +185,9 @@ def search_everywhere(task: Task, num_starts: int, config: FindPoseConfig) -> Fo
         confidence = torch.where(degenerate, 0.0, pose_confidence(problem, found.poses[:, 0], lead))
         best = found.distinct(SEARCH_BUDGET.same, num_starts)
         poses = shifted(best.poses, origin.unsqueeze(1))
-        starts = PoseStarts(poses=poses, costs=best.costs, confidence=confidence)
+        # What they miss ranks them, too.
+        left = alignment_cost(problem.repeated(best.poses.shape[1]), best.poses.flatten(0, 1)).view_as(best.costs)
+        starts = PoseStarts(poses=poses, costs=left, confidence=confidence)
         rivals = torch.where(_are_rivals(best).unsqueeze(-1), poses, torch.nan)[:, 1:]
     if seen.everything is not None:
         # In data of the whole clouds, each of those drawn stands for several.

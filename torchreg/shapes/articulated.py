@@ -25,7 +25,6 @@ from torchreg.shapes.shaped import ShapedTree, blended
 from torchreg.shapes.shaped_rig import Coefficients, ShapeDirs, person_spec, save_rig
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.spec import RigSurface, ShapeSpec
-from torchreg.shapes.surface import file_skin
 
 if TYPE_CHECKING:
     from torchreg.shapes.kinematics import Chain
@@ -430,4 +429,8 @@ class ArticulatedShape(Articulation):
         Raises:
             InputError: if the shape was not read from a file with a mesh.
         """
-        return file_skin(self)
+        if self.surface is None:
+            raise InputError("this shape has no file skin: it was not read from a file with a mesh")
+        vertices = self.surface.vertices.to(self.rest)
+        faces = self.surface.faces.to(self.rest.device)
+        return LinearBlendSkin(self, vertices, self.surface.weights, torch.zeros_like(self.rest), faces=faces)

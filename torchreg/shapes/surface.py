@@ -117,15 +117,6 @@ def _first_copies(skin: LinearBlendSkin) -> Tensor:
     return torch.where((skin.weights[first] == skin.weights).all(-1), first, index)
 
 
-def file_skin(shape: Articulation) -> LinearBlendSkin:
-    """Return the skin of the file that a shape was read from, with faces; InputError if that had no mesh."""
-    if shape.surface is None:
-        raise InputError("this shape has no file skin: it was not read from a file with a mesh")
-    vertices = shape.surface.vertices.to(shape.rest)
-    faces = shape.surface.faces.to(shape.rest.device)
-    return LinearBlendSkin(shape, vertices, shape.surface.weights, torch.zeros_like(shape.rest), faces=faces)
-
-
 def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
     """Return a dense skin of samples, with normals, of the file's mesh."""
     surface = shape.surface

@@ -24,9 +24,9 @@ from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.visibility import sample_visible
 from torchreg.registration.dense.scan_matcher import match_probabilities, shared_matcher
 from torchreg.registration.dense.scan_tokens import ScanTokens
+from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOFS
-from torchreg.shapes.surface import file_skin
 from torchreg.solvers.e_step import EStep
 
 
@@ -65,12 +65,12 @@ _VIEWS: WeakKeyDictionary[Articulation, tuple[object, tuple[ScanTokens, Tensor]]
 def can_be_matched(problem: AlignProblem) -> bool:
     """Return whether a shape has the surface of a file, and its base is free."""
     free = bool((problem.lower[..., :BASE_DOFS] < problem.upper[..., :BASE_DOFS]).all())
-    return free and problem.skin.shape.surface is not None
+    return free and isinstance(problem.skin.shape, ArticulatedShape) and problem.skin.shape.surface is not None
 
 
 def matched_poses(windows: DataWindows, problem: AlignProblem, count: int) -> tuple[Tensor, Tensor]:
     """Return aligned poses (B, count, num_dofs) by matches of the surface and the data, and the best windows (B,)."""
-    views, places = _views(problem.skin.shape)
+    views, places = _views(cast(ArticulatedShape, problem.skin.shape))
     matches = [
         _matches(points[valid], views, places.to(points))
         for points, valid in zip(windows.problem.data, windows.problem.valid, strict=True)
@@ -155,7 +155,7 @@ def _registered(shape: Articulation, points: Tensor, places: Tensor, weight: Ten
     return pose
 
 
-def _views(shape: Articulation) -> tuple[ScanTokens, Tensor]:
+def _views(shape: ArticulatedShape) -> tuple[ScanTokens, Tensor]:
     """Return the tokens of views of a shape's surface at rest, and the places (V, T, 3) of those."""
     made = _VIEWS.get(shape)
     if made is None or made[0] is not shape.surface:
@@ -165,8 +165,8 @@ def _views(shape: Articulation) -> tuple[ScanTokens, Tensor]:
     return made[1]
 
 
-def _made_views(shape: Articulation) -> tuple[ScanTokens, Tensor]:
-    skin, rest = file_skin(shape), shape.rest_pose()
+def _made_views(shape: ArticulatedShape) -> tuple[ScanTokens, Tensor]:
+    skin, rest = shape.file_skin(), shape.rest_pose()
     mesh = TriangleMesh(skin(rest), cast(Tensor, skin.faces))
     lower, upper = mesh.bounds()
     tokens, places, normals = [], [], mesh.face_normals()

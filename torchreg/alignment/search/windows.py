@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
 from torchreg.alignment.fit.problem import AlignProblem
+from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.geometry.sampling import farthest_points
 
 
@@ -23,6 +24,8 @@ class _Windowing:
     same: float = 0.2  # windows nearer than this are one
     inside: float = 0.95  # share of the data in a first window with which there are no others
     least: int = 60  # data in a window
+    neighbors: int = 4  # of a datum, the farthest of which tells how dense the data are
+    dense: float = 3.0  # medians of that distance up to which a datum is not scattered
 
 
 _WINDOWING = _Windowing()
@@ -61,11 +64,18 @@ class DataWindows(Generic[Problem]):
 def _windows(data: Tensor, valid: Tensor, size: float) -> list[Tensor]:
     """Return the masks (M,) of data (M, 3) in each window: of all where they fit in one."""
     points, radius = data[valid], _WINDOWING.radius * size
+    if len(points) > _WINDOWING.neighbors:
+        # Scattered outliers are no other thing.
+        apart = k_nearest_others(points, _WINDOWING.neighbors)[1].amax(-1)
+        points = points[apart <= _WINDOWING.dense * apart.median()]
 
     def around(center: Tensor) -> Tensor:
         return ((data - center).norm(dim=-1) < radius) & valid
 
-    if len(points) == 0 or float(around(points.median(0).values).sum() / len(points)) > _WINDOWING.inside:
+    if len(points) == 0:
+        return [valid]
+    near = (points - points.median(0).values).norm(dim=-1) < radius
+    if float(near.double().mean()) > _WINDOWING.inside:
         return [valid]
     centers: list[Tensor] = []
     for center in points[farthest_points(points, min(_WINDOWING.centers, len(points)))]:
