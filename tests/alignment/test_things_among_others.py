@@ -127,3 +127,22 @@ def test_a_batch_of_clouds_with_padding_is_a_loop_in_either_precision(beast):
     assert double.dtype == torch.float64
     off = surface_skin(beast)(double.float()) - surface_skin(beast)(batch)
     assert float(off.norm(dim=-1).mean()) < 0.02
+
+
+def test_starts_from_which_nothing_is_found_are_searched_for_unless_they_are_meant(plain_hand):
+    """Alone as in a batch; what is held, or never searched, stays with its start."""
+    pose = plain_hand.clamp(plain_hand.rest_pose() + 0.1 * torch.randn(27, generator=generator(3)))
+    points = cloud_of(plain_hand, pose, 0)
+    wrong = pose + torch.tensor([0.3, 0.0, 0.1, 0.0, 2.5, 1.0] + [0.0] * 21)
+    both = tr.align(plain_hand, torch.stack([points, points]), torch.stack([pose, wrong]))
+    alone = tr.align(plain_hand, points, wrong)
+    assert both.statuses == (alone.status,) * 2 == (tr.Status.CONVERGED,) * 2
+    truth = plain_hand.keypoints(pose)
+    assert float((both.keypoints - truth).norm(dim=-1).max()) < 0.01
+    torch.testing.assert_close(both.pose[1], alone.pose, atol=1e-4, rtol=0)
+    assert both.doubt[1] == alone.doubt
+    assert bool(both.rivals.isnan().all()) and len(alone.rivals) == 0
+    never = tr.align(plain_hand, points, wrong, config=tr.AlignConfig(search="never"))
+    held = tr.align(plain_hand, points, wrong, locked="base")
+    assert never.statuses != (tr.Status.CONVERGED,) != held.statuses
+    torch.testing.assert_close(held.pose[:6], wrong[:6])

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.annealed_em import OnStep
 from torchreg.alignment.inputs import Task
 from torchreg.alignment.known_dofs import KnownDofs
@@ -54,7 +53,8 @@ def align(
     """Return the pose in which an articulated shape lies on 3-D data, with inliers, distances and posterior.
 
     Annealed EM registers model points to data points and rejects outliers; then the surface is fitted to the data.
-    Where that cannot be trusted, candidates around the start are refined in one batch and recombined limb by limb.
+    Where that cannot be trusted, candidates around the start are refined in one batch and recombined limb by limb;
+    where the result is still in doubt, the shape is sought everywhere, as without a start, and the surer pose returned.
 
     Args:
         shape: the articulated shape, in metres.
@@ -158,9 +158,7 @@ def _aligned(task: Task, data: Any, mask: Tensor | None = None, **keypoints: Any
         rows = rows.annealed()  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
         rows = rows.fitted()  # eqs. 21 and 22: section 3.4
         found = rows.restarted().finished().judged()
-        confidence = 1.0 if found.confidence is None else found.confidence
-        if isinstance(rows, PersonRows) and rows.is_proposed and float(confidence) < CALIBRATION.doubtful:
-            found = rows.searched_too().restarted().finished().judged()
+        found = rows.searched_in_doubt(found)
     person = task.shape if found.coefficients is None else task.shape.with_coefficients(found.coefficients)
     return replace(to_world(found, task.seen.origin), shape=person)
 

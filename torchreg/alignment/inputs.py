@@ -127,6 +127,23 @@ class Observation:
         points = self.points - origin.to(self.points.device)
         return replace(self, points=points, free_space=space, keypoints=keypoints, origin=origin)
 
+    def rows(self, index: Tensor) -> Observation:
+        """Return the observation of some clouds of a batch (B, M, 3), itself without a batch."""
+        if self.points.ndim == 2:
+            return self
+        keypoints, frames = self.keypoints, tuple(self.frames[number] for number in index.tolist() if self.frames)
+        if keypoints is not None and keypoints.targets.ndim == 3:
+            keypoints = replace(keypoints, targets=keypoints.targets[index])
+        return replace(
+            self,
+            points=self.points[index],
+            mask=None if self.mask is None else self.mask[index],
+            free_space=None if self.free_space is None else self.free_space.rows(index),
+            frames=frames,
+            keypoints=keypoints,
+            everything=None if self.everything is None else tuple(value[index] for value in self.everything),
+        )
+
     @torch.no_grad()
     def drawn(self, shape: ArticulatedShape, nan_policy: str, seed: int, *, to_search: bool = False) -> Observation:
         """Return the same with at most as many points per cloud as poses are fitted to, evenly spread."""

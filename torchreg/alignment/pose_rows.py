@@ -23,6 +23,7 @@ from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.search.limb_search import trunk_turns
 from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, mean_distances, score_candidates
 from torchreg.alignment.search.pose_search import explore, needs_search
+from torchreg.alignment.search.start_source import StartSource
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.budget import BUDGET
 from torchreg.result import Status, normal_copy
@@ -189,6 +190,22 @@ class PoseRows:
         left, steps = rows.rows(index), SURFACE_FIT.more_steps
         more = left._refitted(left.found.pose, on_step=left.record, if_better=False, steps=steps, widths=())
         return rows._joined(index, more)
+
+    def searched_in_doubt(self, found: AlignResult) -> AlignResult:
+        """Return the result from given starts, or where that is in doubt, the surer one of a search without a start."""
+        task = self.task
+        index = [row for row, status in enumerate(found.statuses) if status in (Status.DOUBTFUL, Status.FEW_INLIERS)]
+        is_meant = task.config.search == "never" or task.known is not None or isinstance(task.model_points, Tensor)
+        if not index or is_meant or task.start is None or task.in_picture:
+            return found
+        chosen = torch.tensor(index, device=self.start.device)
+        source = StartSource.of(task.shape, initializer=task.source.proposer, upright=task.config.upright)
+        asked = replace(task, start=None, source=source, seen=task.seen.rows(chosen))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # as told of the same data before
+            rows = replace(PoseRows.of(asked), history=self.history)
+            searched = rows.annealed().fitted().restarted().finished().judged()
+        return found.with_surer(chosen, searched)
 
     def judged(self, person: tuple[SurfaceError, Tensor] | None = None) -> AlignResult:
         """Return the result, with what speaks against it; ``person`` is as in `judge`."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from torchreg.alignment.evidence.assignment import assigned
@@ -213,6 +214,31 @@ class AlignResult(Result):
         if shape is None:
             raise InputError("this result has no shape, and no coefficients to make it from")
         return shape.to_gltf(path, source, skin=skin)
+
+    def with_surer(self, index: Tensor, others: AlignResult) -> AlignResult:
+        """Return the result with those rows replaced of which others are surer, and the records of these.
+
+        Args:
+            index: (I,) rows of a batch; the one row of a single problem.
+            others: results of these rows.
+        """
+        if isinstance(self.status, Status):
+            surer = others if float(others.confidence) > float(self.confidence) else self
+            return replace(surer, history=others.history)
+        is_surer = (others.confidence > self.confidence[index]).nonzero()[:, 0]
+        rows, mine = index[is_surer], self
+        if mine.rivals is None and others.rivals is not None:
+            none = others.rivals.new_full((len(mine.pose), *others.rivals.shape[1:]), torch.nan)
+            mine = replace(mine, rivals=none)
+        changed: dict[str, Any] = {"history": others.history}
+        for item in fields(mine):
+            value, other = getattr(mine, item.name), getattr(others, item.name)
+            if item.name in ("status", "doubt"):
+                pairs = dict(zip(rows.tolist(), (other[row] for row in is_surer.tolist()), strict=True))
+                changed[item.name] = tuple(pairs.get(row, value[row]) for row in range(len(value)))
+            elif item.name in mine.shapes and value is not None:
+                changed[item.name] = value.index_copy(0, rows, other[is_surer])
+        return replace(mine, **changed)
 
     @property
     def statuses(self) -> tuple[Status, ...]:

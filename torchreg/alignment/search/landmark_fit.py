@@ -126,6 +126,10 @@ class KeypointRows:
             doubt="; ".join(reasons), dof_confidence=dof_confidence(skin.shape, covariance[0], size),
         ))  # fmt: skip
 
+    def searched_in_doubt(self, found: AlignResult) -> AlignResult:
+        """Return the result: rows of given starts are meant."""
+        return found
+
     def found(self, count: int) -> PoseStarts:
         """Return the first rows as starts."""
         poses = shifted(self.poses[:count], self.problem.origin)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.evidence.confidence import EVIDENCE, leaves_clusters
+from torchreg.alignment.evidence.reliability import CALIBRATION
 from torchreg.alignment.fit.annealed_em import ANNEALING, SigmaSchedule, StageResult, anneal
 from torchreg.alignment.fit.problem import INLIER_SHARE
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, fit_surface
@@ -84,10 +85,12 @@ class PersonRows:
         coarse = problem.draw(SHAPE_FIT.coarse_data, generator)
         return cls(task, problem, coarse, start, generator, start[:1, 0], is_proposed=proposer is not None)
 
-    def searched_too(self) -> PersonRows:
-        """Return the fitted rows that a network proposed together with those of people searched for in the one scan."""
-        rows = PersonRows.of_scans(self.task, *self._scan, None, proposes=False)
-        return replace(self._joined(rows), is_proposed=False)
+    def searched_in_doubt(self, found: AlignResult) -> AlignResult:
+        """Return the result, or if in doubt of what a network proposed, that of people searched for in the scan too."""
+        if not self.is_proposed or found.confidence is None or float(found.confidence) >= CALIBRATION.doubtful:
+            return found
+        rows = self._joined(PersonRows.of_scans(self.task, *self._scan, None, proposes=False))
+        return replace(rows, is_proposed=False).restarted().finished().judged()
 
     def _proposed_too(self) -> PersonRows:
         """Return the rows fitted from a start, and those that a network proposes for the data on which the best lies.
