@@ -139,9 +139,8 @@ class PoseRows:
             found = self._refitted(self.start, on_step=None)
         if config.search == "never":
             return found
-        index = torch.arange(len(self.start), device=self.start.device)
-        if config.search == "auto":
-            index = needs_search(self.problem, self.start, found.found.pose).nonzero()[:, 0]
+        needed = needs_search(self.problem, self.start, found.found.pose, always=config.search == "always")
+        index = needed.nonzero()[:, 0]
         if len(index):
             rows, generator = found.rows(index), torch.Generator().manual_seed(config.seed)
             explored = explore(
@@ -194,7 +193,8 @@ class PoseRows:
     def searched_in_doubt(self, found: AlignResult) -> AlignResult:
         """Return the result from given starts, or where that is in doubt, the surer one of a search without a start."""
         task = self.task
-        index = [row for row, status in enumerate(found.statuses) if status in (Status.DOUBTFUL, Status.FEW_INLIERS)]
+        doubts = set(Status) if task.config.search == "always" else {Status.DOUBTFUL, Status.FEW_INLIERS}
+        index = [row for row, status in enumerate(found.statuses) if status in doubts]
         is_meant = task.config.search == "never" or task.known is not None or isinstance(task.model_points, Tensor)
         if not index or is_meant or task.start is None or task.in_picture:
             return found

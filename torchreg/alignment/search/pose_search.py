@@ -11,15 +11,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchreg.alignment.evidence.confidence import clustered_data, explains, leaves_clusters
-from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.evidence.confidence import clustered_data, leaves_clusters
 from torchreg.alignment.fit.annealed_em import narrowing
 from torchreg.alignment.fit.problem import AlignProblem
 from torchreg.alignment.search.limb_search import Effort, LimbSearch
-from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, align_rows, descend, take_rows
+from torchreg.alignment.search.multi_start import SEARCH_BUDGET, Candidates, Plan, descend, take_rows
 from torchreg.alignment.search.rough_poses import register_rigidly
 from torchreg.geometry.sampling import farthest_points
-from torchreg.shapes.limbs import Limb, find_limbs
+from torchreg.shapes.limbs import Limb
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, SkinSurface
@@ -166,15 +165,15 @@ _SCATTER = _Scatter()
 _AROUND = _Around()
 
 
-def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
-    """Return a mask (B,) of problems with which a single descent cannot be trusted.
+def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor, *, always: bool = False) -> Tensor:
+    """Return a mask (B,) of problems with which a single descent cannot be trusted, or is ``always`` mistrusted.
 
-    Either it went far from its start, where other minima are as near; or it leaves an unexplained cluster of data. Of a
-    skinned rig it is what data it leaves unexplained alone: a redundant bone of its spine may turn far.
+    Either it went far from its start, where other minima are as near; or it leaves an unexplained cluster of data. The
+    limbs of a skinned rig, without a solid trunk, are not placed one by one: it is sought everywhere or not at all.
     """
     if isinstance(problem.surface, SkinSurface):
-        return explains(problem, pose, torch.full_like(pose[:, 0], torch.inf)) < CALIBRATION.doubtful
-    return (_motion(start, pose) > _TRUST.motion) | leaves_clusters(problem, pose)
+        return torch.zeros_like(pose[:, 0], dtype=torch.bool)
+    return (_motion(start, pose) > (-1 if always else _TRUST.motion)) | leaves_clusters(problem, pose)
 
 
 def _motion(start: Tensor, pose: Tensor) -> Tensor:
@@ -192,11 +191,8 @@ def explore(
 
     Limbs are placed anew from the poses ``descended`` from the starts. Where that shows that one was in a wrong
     minimum, ``candidates`` per problem are scattered around the start and the best pose so far, and go through
-    `PoseSearch`, the last stage at most ``rounds`` times. Of a skinned rig half as many are scattered at once, and all
-    of their joints aligned, see `align_rows`. The draws for a problem do not depend on the others.
+    `PoseSearch`, the last stage at most ``rounds`` times. The draws for a problem do not depend on the others.
     """
-    if isinstance(problem.surface, SkinSurface):
-        return _aligned_around(problem, start, descended, candidates, generator)
     search = PoseSearch(problem, generator)
     before = search.fitted_score(descended)
     poses, scores = search.refine(descended.unsqueeze(1), 1)
@@ -210,16 +206,6 @@ def explore(
     better = (value < score[rows]).unsqueeze(-1)
     best[rows] = torch.where(better, found, best[rows])
     return best
-
-
-def _aligned_around(
-    problem: AlignProblem, start: Tensor, descended: Tensor, candidates: int, generator: torch.Generator
-) -> Tensor:
-    """Return the best poses of rigs whose candidates around the starts and the descents are aligned whole."""
-    limbs, count = find_limbs(problem.skin.shape)[0], max(1, candidates // 4)
-    pool = [_scatter(problem, limbs, center, count, generator) for center in (start, descended)]
-    aligned = align_rows(problem, torch.cat(pool, dim=1), _AROUND.num_refined, generator)
-    return Candidates.fitted(problem, aligned).poses[:, 0]
 
 
 def _search_around(
