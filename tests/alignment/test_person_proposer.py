@@ -93,17 +93,22 @@ def test_people_are_proposed_in_the_frame_in_which_they_stand(body, sitter, axis
 
 def test_a_good_proposal_needs_no_search_and_a_bad_one_is_searched_for(body, sitter, monkeypatch):
     state, points = sitter
-    searched = []
-    search = person_rows.PersonRows.searched_too
-    monkeypatch.setattr(person_rows.PersonRows, "searched_too", lambda rows: searched.append(1) or search(rows))
+    searched, search = [], person_rows.PersonRows.searched_in_doubt
+
+    def watched(rows, proposed):
+        found = search(rows, proposed)
+        searched.append(found is not proposed)
+        return found
+
+    monkeypatch.setattr(person_rows.PersonRows, "searched_in_doubt", watched)
     vertices = body.vertices(*state.tensor_split([body.num_dofs]))
     found = tr.align(body, points, fit_shape=True, clothed=False, initializer=told(body, state, points), config=QUICK)
-    assert not searched
+    assert searched == [False]
     assert float((body.vertices(found.pose, found.coefficients) - vertices).norm(dim=-1).mean()) < 0.03
     assert found.evidence is not None
     wrong = told(body, state, points, right=False)
     tr.align(body, points, fit_shape=True, clothed=False, initializer=wrong, config=QUICK)
-    assert searched
+    assert searched == [False, True]
     with pytest.raises(tr.errors.InputError, match="a PersonProposer with fit_shape"):
         tr.align(body, points, initializer=wrong)
 

@@ -141,7 +141,8 @@ def test_starts_from_which_nothing_is_found_are_searched_for_unless_they_are_mea
     assert float((both.keypoints - truth).norm(dim=-1).max()) < 0.01
     torch.testing.assert_close(both.pose[1], alone.pose, atol=1e-4, rtol=0)
     assert both.doubt[1] == alone.doubt
-    assert bool(both.rivals.isnan().all()) and len(alone.rivals) == 0
+    assert bool(both.rivals.isnan().all())
+    assert len(alone.rivals) == 0
     never = tr.align(plain_hand, points, wrong, config=tr.AlignConfig(search="never"))
     held = tr.align(plain_hand, points, wrong, locked="base")
     assert never.statuses != (tr.Status.CONVERGED,) != held.statuses

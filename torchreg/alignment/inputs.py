@@ -134,6 +134,7 @@ class Observation:
         keypoints, frames = self.keypoints, tuple(self.frames[number] for number in index.tolist() if self.frames)
         if keypoints is not None and keypoints.targets.ndim == 3:
             keypoints = replace(keypoints, targets=keypoints.targets[index])
+        everything = None if self.everything is None else (self.everything[0][index], self.everything[1][index])
         return replace(
             self,
             points=self.points[index],
@@ -141,7 +142,7 @@ class Observation:
             free_space=None if self.free_space is None else self.free_space.rows(index),
             frames=frames,
             keypoints=keypoints,
-            everything=None if self.everything is None else tuple(value[index] for value in self.everything),
+            everything=everything,
         )
 
     @torch.no_grad()

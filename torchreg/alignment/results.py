@@ -221,24 +221,29 @@ class AlignResult(Result):
         Args:
             index: (I,) rows of a batch; the one row of a single problem.
             others: results of these rows.
+
+        Raises:
+            InputError: if a result has no confidence.
         """
+        mine, theirs = self.confidence, others.confidence
+        if mine is None or theirs is None:
+            raise InputError("these results keep no confidence; align again")
         if isinstance(self.status, Status):
-            surer = others if float(others.confidence) > float(self.confidence) else self
-            return replace(surer, history=others.history)
-        is_surer = (others.confidence > self.confidence[index]).nonzero()[:, 0]
-        rows, mine = index[is_surer], self
-        if mine.rivals is None and others.rivals is not None:
-            none = others.rivals.new_full((len(mine.pose), *others.rivals.shape[1:]), torch.nan)
-            mine = replace(mine, rivals=none)
+            return replace(others if float(theirs) > float(mine) else self, history=others.history)
+        is_surer = (theirs > mine[index]).nonzero()[:, 0]
+        rows, joined = index[is_surer], self
+        if joined.rivals is None and others.rivals is not None:
+            none = others.rivals.new_full((len(self.pose), *others.rivals.shape[1:]), torch.nan)
+            joined = replace(joined, rivals=none)
         changed: dict[str, Any] = {"history": others.history}
-        for item in fields(mine):
-            value, other = getattr(mine, item.name), getattr(others, item.name)
+        for item in fields(joined):
+            value, other = getattr(joined, item.name), getattr(others, item.name)
             if item.name in ("status", "doubt"):
                 pairs = dict(zip(rows.tolist(), (other[row] for row in is_surer.tolist()), strict=True))
                 changed[item.name] = tuple(pairs.get(row, value[row]) for row in range(len(value)))
-            elif item.name in mine.shapes and value is not None:
+            elif item.name in joined.shapes and value is not None:
                 changed[item.name] = value.index_copy(0, rows, other[is_surer])
-        return replace(mine, **changed)
+        return replace(joined, **changed)
 
     @property
     def statuses(self) -> tuple[Status, ...]:
