@@ -25,7 +25,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -45,7 +45,7 @@ from torchreg.alignment import pose_rows
 from torchreg.alignment.evidence import picture_agreement, reliability
 from torchreg.alignment.evidence.confidence import limb_data
 from torchreg.alignment.evidence.picture_agreement import LimbModel, PictureModel, picture_views
-from torchreg.alignment.evidence.reliability import Calibration
+from torchreg.alignment.evidence.reliability import EVIDENCE_NAMES, Calibration
 from torchreg.alignment.find_pose import FindPoseConfig
 from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.pose_algebra import shifted
@@ -58,7 +58,8 @@ ROOM_FAMILIES = {"hand": "room with a hand", "held": "room with a hand", "arm": 
 LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed to doubt it
 FAR, CUT_OFF = 0.4, 0.7  # of the size, between which poses tell nothing; of the data, at most
 # Of poses that explain as much one is right, which shapes without symmetry do not teach.
-RIVALS = [[item.name for item in fields(reliability.Evidence)].index(name) for name in ("rival", "rival_share")]
+RIVALS = [EVIDENCE_NAMES.index(name) for name in ("rival", "rival_share")]
+UNKNOWN, WRONG = EVIDENCE_NAMES.index("unknown"), 2.0  # times that a wrong pose counts: a lie costs more than a doubt
 FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
 
 
@@ -195,26 +196,28 @@ def fitted_poses(cases: Sequence[Judged]) -> dict[str, Calibration]:
     """
     told = [case for case in cases if not case.in_room or case.told[2] is not None]
     rooms = by_family([case for case in told if case.in_room], reliability.PICTURE_CALIBRATION)
-    return rooms | by_family([case for case in told if not case.in_room], reliability.CALIBRATION, RIVALS)
+    return rooms | by_family([case for case in told if not case.in_room], reliability.CALIBRATION, [*RIVALS, UNKNOWN])
 
 
 def by_family(cases: Sequence[Judged], before: Calibration, held: Sequence[int] = ()) -> dict[str, Calibration]:
     """Return a model of each family: the weights are those of all, the bias is its own.
 
     The model fitted to other cases ``before`` is moved, except for weights that are ``held``. A family's bias is off
-    the common one by a normal deviate of `BIAS_STD`, so that few cases change little.
+    the common one by a normal deviate of `BIAS_STD`, so that few cases change little. Of poses cases count as far as
+    the data show all limbs.
     """
     if not cases:
         return {}
     table, right = torch.stack([case.evidence for case in cases if case.evidence is not None]).double(), rights(cases)
-    common, found = fit_logistic(table, right, before=before, held=held), {}
+    weights = torch.where(right, 1.0, WRONG) * (1 - table[:, UNKNOWN]) if before.is_of_poses else None
+    common, found = fit_logistic(table, right, weights, before, held), {}
     for family in dict.fromkeys(case.family for case in cases):
         chosen = torch.tensor([case.family == family for case in cases])
         offsets = torch.linspace(-4, 4, 161, dtype=torch.float64).unsqueeze(-1)
         odds = common.log_odds(table[chosen]) + offsets
         likelihood = -torch.nn.functional.softplus(torch.where(right[chosen], -odds, odds)).sum(-1, keepdim=True)
         offset = float(offsets[(likelihood - 0.5 * (offsets / BIAS_STD).square()).argmax()])
-        found[family] = Calibration(bias=round(common.bias + offset, 2), weights=common.weights)
+        found[family] = replace(before, bias=round(common.bias + offset, 2), weights=common.weights)
     return found
 
 

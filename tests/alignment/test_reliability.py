@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 import torchreg as tr
 from tests.alignment.conftest import DESCENT
 from tests.alignment.made import joint, shape_of, solid
-from torchreg.alignment.evidence.confidence import SurfaceResiduals
+from torchreg.alignment.evidence.confidence import SurfaceResiduals, doubled_data, overlap
 from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.fit.problem import centered_problem
@@ -85,6 +85,29 @@ def test_surface_without_data_counts_as_unseen_where_a_camera_would_see_it(plain
         unseen_share(row, poses[1:], alone.distance, alone.jacobian),
         unseen_share(problem, poses, residuals.distance, residuals.jacobian)[1:],
     )
+
+
+def test_limbs_in_each_other_overlap_and_explain_data_twice():
+    """Two equal fingers on one hinge of a palm lie apart at rest, half in each other, and at one place."""
+    joints = [joint("palm", -1), *(joint(name, 0, (0, 0, 0), "revolute", (1.0, 0.0, 0.0), *sorted((side, 2 * side)))
+                                   for name, side in (("near", -0.8), ("far", 0.8)))]  # fmt: skip
+    solids = [solid("ellipsoid", (0.03, 0.03, 0.02)), *[solid("ellipsoid", (0.01, 0.01, 0.06), 0, 0, 0.09)] * 2]
+    shape = shape_of(joints, solids, nu=0.003, dtype=torch.float64)
+    skin, turns = tr.sample_skin(shape, 400), torch.tensor([0.8, 0.1, 0.0], dtype=torch.float64)
+    pose = torch.cat([shape.rest_pose()[:6].expand(3, 6), -turns[:, None], turns[:, None]], dim=1)
+    data = skin(pose) + noise_of(3, len(skin), dtype=torch.float64)
+    problem = centered_problem(
+        skin, data, torch.ones(3, len(skin), dtype=torch.bool), pose, torch.zeros(3, 3, dtype=torch.float64),
+        prior_std=None, pose_atol=0.0,
+    )  # fmt: skip
+    shares, part = overlap(problem, pose), skin.weights.argmax(-1)
+    assert bool((shares[0] == 0).all() & (shares[1] > 0.1).all() & (shares[1] < shares[2]).all())
+    # All of a finger but what the palm explains anyhow.
+    assert float(shares[2].min()) > 0.8
+    assert torch.allclose(shares[:, 0], shares[:, 1], atol=0.05)
+    assert torch.allclose(overlap(problem.rows(torch.tensor([2])), pose[2:]), shares[2:])
+    expected = (shares * torch.stack([(part == finger).sum() for finger in (1, 2)])).sum(-1) / 2
+    assert torch.allclose(doubled_data(problem, pose), expected, rtol=0.1)
 
 
 def test_a_fit_goes_on_where_another_step_would_gain(links, links_skin, measured):

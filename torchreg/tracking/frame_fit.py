@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends
+from torchreg.alignment.evidence.confidence import end_motions, end_variances, limb_ends, overlap, own_shares
 from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import hardly_gains
 from torchreg.alignment.evidence.reliability import Evidence, weigh
@@ -155,7 +155,7 @@ class FrameFitter:
             self.skin, origin[None], torch.ones_like(origin[:, :1], dtype=torch.bool), shape.rest[None], origin,
             prior_std=1.0, pose_atol=AlignConfig().pose_atol, debias=config.debias,
         )  # fmt: skip
-        self.size = self._template.size
+        self.size, self._at_rest = self._template.size, own_shares(self._template, shape.rest[None])
         self.inlier_distance = config.inlier_distance or INLIER_SHARE * self.size
         self.clusters = (
             clusters.scaled(self.size) if clusters else UnexplainedClusters(self.skin, self.limbs, self.size)
@@ -308,7 +308,10 @@ class FrameFitter:
         if fit.person is not None:
             error = fit.person.error
             return replace(evidence, unknown=error.unknown(self.size)), bool(error.converged)
-        evidence = replace(evidence, unseen=unseen_share(problem, pose, fit.distance, fit.jacobian).sqrt())
+        unseen = unseen_share(problem, pose, fit.distance, fit.jacobian).sqrt()
+        # The view's skin may hold what was seen last alone.
+        shared = overlap(replace(problem, skin=self.skin), pose, self._at_rest).sum(-1)
+        evidence = replace(evidence, unseen=unseen, overlap=shared)
         converged = float(problem.change(fit.last_step)) <= problem.pose_atol or hardly_gains(
             problem, pose, fit.distance, fit.jacobian, fit.residual[None], covariance[None]
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -243,6 +243,40 @@ def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 def explained_alone(problem: AlignProblem, pose: Tensor, groups: Sequence[Sequence[int]]) -> Tensor:
     """Return the number of data (B, L), softly counted, that only one of L groups of parts explains, for each."""
+    return _alone(problem, pose, groups).sum(-1).mT
+
+
+def overlap(problem: AlignProblem, pose: Tensor, at_rest: Tensor | None = None) -> Tensor:
+    """Return the share (B, L) of each limb's skin that lies on other parts in poses, but does not at rest.
+
+    Where two limbs lie in each other, both explain the data of one. ``at_rest`` (1, L) are the `own_shares` there.
+    """
+    at_rest = own_shares(problem, problem.skin.shape.rest_pose()[None]) if at_rest is None else at_rest
+    return (at_rest - own_shares(problem, pose)).clamp_min(0)
+
+
+def own_shares(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the share (B, L) of each limb's skin that no other part explains; one without limbs."""
+    limbs, points = limb_points(problem.skin), problem.skin(pose)
+    if not limbs:
+        return torch.ones_like(pose[:, :1])
+    on_skin = replace(problem, data=points, valid=torch.ones_like(points[..., 0], dtype=torch.bool))
+    tables = _alone(on_skin, pose, [limb.parts for limb, _ in limbs])
+    return torch.stack([table[:, index].mean(-1) for table, (_, index) in zip(tables, limbs, strict=True)], -1)
+
+
+def doubled_data(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return how many data (B,) two limbs explain that lie in each other, of which one would have its own elsewhere."""
+    limbs = limb_points(problem.skin)
+    if not limbs:
+        return torch.zeros_like(pose[:, 0])
+    count = soft_inliers(problem, problem.surface.distance(problem.data, pose)).sum(-1)
+    shares = pose.new_tensor([len(index) / len(problem.skin) for _, index in limbs])
+    return count * (overlap(problem, pose) * shares).sum(-1) / 2
+
+
+def _alone(problem: AlignProblem, pose: Tensor, groups: Sequence[Sequence[int]]) -> Tensor:
+    """Return the degree (L, B, M) to which only one of L groups of parts explains data."""
     distances = problem.skin.shape.distances_without(problem.data, pose, [(), *groups])
-    explained, *by_rest = soft_inliers(problem, distances).unbind(0)
-    return torch.stack([(explained - rest).clamp_min(0).sum(-1) for rest in by_rest], dim=-1)
+    explained = soft_inliers(problem, distances)
+    return (explained[:1] - explained[1:]).clamp_min(0)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.evidence.confidence import doubled_data
 from torchreg.alignment.evidence.coverage import missing_data
 from torchreg.alignment.fit.annealed_em import ANNEALING, anneal, narrowing
 from torchreg.alignment.fit.problem import PRIOR_SHARE, AlignProblem, alignment_cost
@@ -135,8 +136,8 @@ def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tens
 
 
 def candidate_cost(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the cost (B,) that ranks fitted candidates: of data that they leave unexplained, or that they miss."""
-    return alignment_cost(problem, pose) + missing_data(problem, pose)
+    """Return the cost (B,) that ranks fitted candidates: of data that they leave unexplained, miss, or explain twice."""
+    return alignment_cost(problem, pose) + missing_data(problem, pose) + doubled_data(problem, pose)
 
 
 def align_rows(problem: AlignProblem, poses: Tensor, count: int, generator: torch.Generator) -> Tensor:
