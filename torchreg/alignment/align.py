@@ -54,8 +54,8 @@ def align(
 
     Annealed EM registers model points to data points and rejects outliers; then the surface is fitted to the data.
     Where that cannot be trusted, candidates around the start are refined in one batch and recombined limb by limb;
-    where the result is still in doubt, or turned far from its start, the shape is sought everywhere, as without a start,
-    and the surer pose returned.
+    where the result is still in doubt, or turned far from its start, the shape is sought everywhere, and the surer pose
+    returned.
 
     Args:
         shape: the articulated shape, in metres.

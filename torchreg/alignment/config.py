@@ -20,8 +20,9 @@ class AlignConfig:
         m_steps: Levenberg-Marquardt steps per M-step.
         surface_steps: Levenberg-Marquardt steps at each width of the surface fit; 0 leaves the surface fit out.
         search: look for better poses around the start: "always", "never", or "auto": when the descent
-            went far from its start or leaves a dense cluster of data unexplained. But for "never", a result in doubt or turned
-            far from its start is searched for everywhere, unless degrees of freedom are locked or have a prior.
+            went far from its start or leaves a dense cluster of data unexplained. But for "never", a result in doubt,
+            or turned far from its start, is searched for everywhere, unless degrees of freedom are locked or have a
+            prior.
         num_candidates: poses that a search starts from.
         search_rounds: rounds of the search's last stage, which places every limb thoroughly.
         inlier_distance: data nearer to the fitted surface are inliers, metres; 2 % of the model's size by default.

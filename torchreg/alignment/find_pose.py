@@ -12,8 +12,8 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.confidence import explains, is_misfit, pose_confidence
-from torchreg.alignment.evidence.reliability import CALIBRATION, rival_margin, without_cut
+from torchreg.alignment.evidence.confidence import is_misfit
+from torchreg.alignment.evidence.reliability import CALIBRATION, pose_confidence, rival_margin, without_cut
 from torchreg.alignment.fit.problem import BROAD_PRIOR, AlignProblem, alignment_cost, centered_problem, masked_mean
 from torchreg.alignment.inputs import (
     Task,
@@ -216,8 +216,8 @@ def _find(
         return _search_with_retries(proposed, source, config)
     found = Candidates.fitted(proposed.problem, proposed.poses)
     uncropped = without_cut(proposed.window, found.poses[:, 0], frames)
-    sure = explains(uncropped, found.poses[:, 0], found.lead()) >= CALIBRATION.doubtful
-    rows = (~sure).nonzero()[:, 0]
+    confidence = pose_confidence(uncropped, found.poses[:, 0], found.lead(), determined=True)
+    rows = (confidence < CALIBRATION.doubtful).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     count = min(config.num_searched, config.num_placed)
     poses, costs = found.poses[:, :1].repeat(1, count, 1), found.costs[:, :1].repeat(1, count)

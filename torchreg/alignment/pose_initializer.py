@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from torchreg._checks import check_choice, check_count, check_positive, check_shape
 from torchreg.alignment.config import AlignConfig
-from torchreg.alignment.evidence.confidence import EVIDENCE, clustered_data, pose_confidence
-from torchreg.alignment.evidence.reliability import CALIBRATION
+from torchreg.alignment.evidence.confidence import EVIDENCE, clustered_data
+from torchreg.alignment.evidence.reliability import CALIBRATION, pose_confidence
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit.annealed_em import ANNEALING, anneal
 from torchreg.alignment.fit.implicit_gradient import FixedPoint, attach_gradients

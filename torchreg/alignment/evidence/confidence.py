@@ -138,25 +138,6 @@ class SurfaceResiduals:
         return 1 - (1 - (-self.limb_data / count).exp()) * (1 - self.contradicted)
 
 
-def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
-    """Return the confidence (B,) in fitted poses from the ``lead`` over rivals, misfit, clusters and limbs' ends."""
-    return explains(problem, pose, lead) * known_ends(problem, pose)
-
-
-def explains(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
-    """Return the confidence (B,) without the observability factor, which no search would improve."""
-    left = left_over(problem, pose)
-    return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left / EVIDENCE.left_over).exp()
-
-
-def left_over(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the near outliers and data in dense clusters (B,), as a share of the data on the surface."""
-    clustered, near = clustered_data(problem, pose)
-    return clustered.to(pose) / near.clamp_min(1) + near_outlier_share(
-        problem, problem.surface.distance(problem.data, pose)
-    )
-
-
 def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return a mask (B,) of poses that leave too many data near the surface; outliers are spread more thinly."""
     return (
@@ -171,12 +152,6 @@ def near_outlier_share(problem: AlignProblem, distance: Tensor, off: OffSurface 
     beyond = off.distance(noise, problem.size).unsqueeze(-1)
     beside = (distance.abs() > beyond) & (distance.abs() < _MISFIT.reach * problem.size) & problem.valid
     return beside.sum(-1).to(problem.data) / problem.valid.sum(-1).clamp_min(1)
-
-
-def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the probability (B,), by Rayleigh's distribution, that the ends of limbs lie within the tolerance."""
-    spread = end_spreads(problem, pose).mean(-1)
-    return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
 
 
 def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Tensor:

@@ -32,6 +32,7 @@ from torchreg.alignment.evidence.curvature import (
     told_open,
 )
 from torchreg.alignment.evidence.picture_agreement import PICTURE_MODEL, PictureEvidence, open_rims, planes_instead
+from torchreg.alignment.fit.free_space_term import FreeSpaceTerm
 from torchreg.alignment.fit.problem import AlignProblem, free_space_loss
 from torchreg.alignment.fit.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.capture.depth_frame import DepthFrame
@@ -101,28 +102,31 @@ _SCALES = _Scales()
 
 @dataclass(frozen=True)
 class Calibration(Logistic):
-    """The model of the confidence: ``sigmoid(bias - sum_k weight_k evidence_k)``, for poses times ``1 - unknown``.
+    """The model of the confidence: ``sigmoid(bias - sum_k weight_k e_k)``, of poses times (1 - unknown) (1 - rival).
 
-    A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average: it is found, and
-    what no data show is near. Fitted, by what ``benchmarks/calibrate_confidence.py`` does, to 535 made-up alignments:
-    400 clouds of rigs of all kinds, hands, arms and a fox that are alone, beside another thing, touch it, or are not
-    there (``benchmarks/company.py``), and 135 of hands and arms alone; free space and rivals are held, as most of these
-    shapes lack a camera and symmetries; weights of open rims and planes are those of 68 made-up rooms. Bias and overlap
-    alone are fitted to 180 clouds in company and 250 of hands, by far and by near limbs, of which wrong ones count
-    twice: what is sure and wrong costs more than a doubt.
+    A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average: it is found, what
+    no data show is near, and no other pose is as good. Fitted, by what ``benchmarks/calibrate_confidence.py`` does, to
+    535 made-up alignments: 400 clouds of rigs of all kinds, hands, arms and a fox that are alone, beside another thing,
+    touch it, or are not there (``benchmarks/company.py``), and 135 of hands and arms alone; free space and rivals are
+    held, as most of these shapes lack a camera and symmetries; weights of open rims and planes are those of 68 made-up
+    rooms. Bias and overlap alone are fitted to 180 clouds in company and 250 of hands, of which wrong ones count twice:
+    what is sure and wrong costs more than a doubt.
     """
 
     bias: float = 8.63
     # As `Evidence` has them.
-    weights: tuple[float, ...] = (2.27, 11.31, 1.9, 0.0, 8.53, 6.38, 2.41, 0.0, 1.03, 3.93, 20.44, 3.78, 0.0, 0.0)
+    weights: tuple[float, ...] = (2.27, 11.31, 1.9, 0.0, 8.53, 6.38, 2.41, 0.0, 0.0, 3.93, 20.44, 3.78, 0.0, 0.0)
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
-    is_of_poses: bool = True  # else what is unknown is evidence as all else
+    is_of_poses: bool = True  # else `unknown` and `rival` are evidence as all else
 
     def probability(self, evidence: Tensor) -> Tensor:
         """Return the probabilities (...) of evidence (..., E)."""
-        hidden = evidence[..., EVIDENCE_NAMES.index("unknown")] if self.is_of_poses else 0.0
-        return super().probability(evidence) * (1 - hidden)
+        found = super().probability(evidence)
+        if not self.is_of_poses:
+            return found
+        unknown, rival = (evidence[..., EVIDENCE_NAMES.index(name)] for name in ("unknown", "rival"))
+        return found * (1 - unknown) * (1 - rival)
 
     def status(self, converged: bool, confidence: float) -> Status:
         """Return the status of a fit by what is known of it."""
@@ -236,12 +240,9 @@ def judge(
     if person is None:
         residuals = SurfaceResiduals.of(problem, pose)
         distance, spreads = residuals.distance, end_spreads(problem, pose, residuals)
-        evidence = gather_evidence(problem, pose, distance, lead, spreads)
-        evidence = replace(evidence, overlap=overlap(problem, pose).sum(-1))
+        evidence = _pose_evidence(problem, pose, lead, residuals, spreads, in_cloud=picture is None)
         loose = spreads > EVIDENCE.tolerance * problem.size
-        if picture is None:
-            evidence = replace(evidence, unseen=unseen_share(problem, pose, distance, residuals.jacobian).sqrt())
-        else:
+        if picture is not None:
             residuals = replace(residuals, contradicted=picture.contradicted)
             loose = loose | (picture.misplaced > CALIBRATION.doubtful)
         around = curvature(problem, pose, residuals)
@@ -269,6 +270,29 @@ def judge(
             for row in zip(doubt_messages(problem, evidence, loose, _turns(pose, rivals)), left_open, strict=True)
         ),
     )
+
+
+def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None, *, determined: bool = False) -> Tensor:
+    """Return the confidence (B,) in fitted poses (B, num_dofs) with a lead (B,) over rivals, see `Calibration`.
+
+    ``determined``: as if the data determined all limbs, which no search would improve.
+    """
+    residuals, in_cloud = SurfaceResiduals.of(problem, pose), problem.factor(FreeSpaceTerm) is None
+    spreads = torch.zeros_like(pose[:, :1]) if determined else end_spreads(problem, pose, residuals)
+    return CALIBRATION.probability(_pose_evidence(problem, pose, lead, residuals, spreads, in_cloud=in_cloud).table())
+
+
+def _pose_evidence(
+    problem: AlignProblem, pose: Tensor, lead: Tensor | None, residuals: SurfaceResiduals, spreads: Tensor, *,
+    in_cloud: bool,
+) -> Evidence:  # fmt: skip
+    """Return the evidence for poses (B, num_dofs) without that of pictures, with `end_spreads` (B, L)."""
+    evidence = gather_evidence(problem, pose, residuals.distance, lead, spreads)
+    evidence = replace(evidence, overlap=overlap(problem, pose).sum(-1))
+    if in_cloud:
+        unseen = unseen_share(problem, pose, residuals.distance, residuals.jacobian)
+        evidence = replace(evidence, unseen=unseen.sqrt())
+    return evidence
 
 
 def _with_far_poses(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals, around: Curvature) -> Tensor:

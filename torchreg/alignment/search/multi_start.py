@@ -136,7 +136,7 @@ def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tens
 
 
 def candidate_cost(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the cost (B,) that ranks fitted candidates: of data that they leave unexplained, miss, or explain twice."""
+    """Return the cost (B,) that ranks fitted candidates: of data left unexplained, missed, or explained twice."""
     return alignment_cost(problem, pose) + missing_data(problem, pose) + doubled_data(problem, pose)
 
 
