@@ -105,12 +105,12 @@ class Calibration(Logistic):
     """The model of the confidence: ``sigmoid(bias - sum_k weight_k e_k)``, of poses by (1 - unknown) (1 - rival).
 
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average: it is found,
-    what no data show is near, and no other pose is as good. Fitted, by what ``benchmarks/calibrate_confidence.py`` does, to
-    535 made-up alignments: 400 clouds of rigs of all kinds, hands, arms and a fox that are alone, beside another thing,
-    touch it, or are not there (``benchmarks/company.py``), and 135 of hands and arms alone; free space and rivals are
-    held, as most of these shapes lack a camera and symmetries; weights of open rims and planes are those of 68 made-up
-    rooms. Bias and overlap alone are fitted to 180 clouds in company and 250 of hands, of which wrong ones count twice:
-    what is sure and wrong costs more than a doubt.
+    what no data show is near, and no other pose is as good. Fitted, by what ``benchmarks/calibrate_confidence.py``
+    does, to 535 made-up alignments: 400 clouds of rigs of all kinds, hands, arms and a fox that are alone, beside
+    another thing, touch it, or are not there (``benchmarks/company.py``), and 135 of hands and arms alone; free
+    space and rivals are held, as most of these shapes lack a camera and symmetries; weights of open rims and planes
+    are those of 68 made-up rooms. Bias and overlap alone are fitted to 180 clouds in company and 250 of hands, of
+    which wrong ones count twice: what is sure and wrong costs more than a doubt.
     """
 
     bias: float = 8.63
