@@ -14,6 +14,7 @@ from tests.alignment.made import joint, shape_of, solid
 from torchreg.alignment.evidence.confidence import SurfaceResiduals, doubled_data, overlap
 from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
+from torchreg.alignment.evidence.reliability import CALIBRATION, EVIDENCE_NAMES
 from torchreg.alignment.fit.problem import centered_problem
 from torchreg.datasets.hand import surface_skin
 from torchreg.geometry.sampling import farthest_points
@@ -85,6 +86,19 @@ def test_surface_without_data_counts_as_unseen_where_a_camera_would_see_it(plain
         unseen_share(row, poses[1:], alone.distance, alone.jacobian),
         unseen_share(problem, poses, residuals.distance, residuals.jacobian)[1:],
     )
+
+
+def test_what_is_hidden_and_what_rivals_a_pose_lower_its_confidence_in_proportion():
+    evidence = torch.zeros(4, len(EVIDENCE_NAMES), dtype=torch.float64)
+    evidence[1, EVIDENCE_NAMES.index("unknown")] = 0.4
+    evidence[2, EVIDENCE_NAMES.index("rival")] = 1.0
+    evidence[3, EVIDENCE_NAMES.index("overlap")] = 1.0
+    found, hidden, tied, overlapping = CALIBRATION.probability(evidence).tolist()
+    assert found > 0.99
+    assert hidden == pytest.approx(0.6 * found)
+    assert tied == 0
+    odds = CALIBRATION.bias - CALIBRATION.weights[EVIDENCE_NAMES.index("overlap")]
+    assert overlapping == pytest.approx(1 / (1 + math.exp(-odds)))
 
 
 def test_limbs_in_each_other_overlap_and_explain_data_twice():

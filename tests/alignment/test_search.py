@@ -5,6 +5,7 @@ import torch
 
 import torchreg as tr
 from tests.alignment.made import TIPS, generator, off
+from torchreg.geometry.rotation import so3_exp, so3_log
 
 CONFIG = tr.AlignConfig(num_candidates=8, search_rounds=1)
 
@@ -68,3 +69,21 @@ def test_clusters_of_data_without_a_finger_are_searched_though_nothing_moved(pla
     config = tr.AlignConfig(num_candidates=2, search_rounds=1)
     assert poses_searched(fit(points, start, locked=little, config=config))
     assert not poses_searched(fit(points, truth, locked=little, config=config))
+
+
+def test_a_start_that_is_turned_far_is_searched_for_everywhere(links, links_skin, links_pose):
+    """There a second EM begins, with wide kernels again, however well the first one ends."""
+    data, starts = links_skin(links_pose), []
+    for turn in (0.3, 1.2):
+        start = links_pose.clone()
+        start[3:6] = so3_log(so3_exp(torch.tensor([[turn, 0, 0]], dtype=torch.float64)) @ so3_exp(start[None, 3:6]))[0]
+        starts.append(start)
+    for start, is_far in zip(starts, (False, True), strict=True):
+        descended = tr.align(links, data, start, model_points=links_skin, config=tr.AlignConfig(search="never"))
+        found = tr.align(links, data, start, model_points=links_skin)
+        assert float(descended.confidence) > 0.5
+        widths = torch.stack([record.sigma[0] for record in found.history if record.stage == "em"])
+        assert bool((widths.diff() > 0).any()) is is_far
+        assert float(found.confidence) >= float(descended.confidence)
+    both = tr.align(links, data.expand(2, -1, -1), torch.stack(starts), model_points=links_skin)
+    assert torch.allclose(both.registered, data.expand(2, -1, -1), atol=2e-3)
