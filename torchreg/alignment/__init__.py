@@ -13,7 +13,8 @@ Besides the public names, other rooms may use `label_frames`, and tracking, whic
   what lies outside of a closed scan: `OutsideTerm`;
   clothes: `CLOTH`, `clothed_rig`, `may_be_clothed`; the network that proposes people: `PersonProposer`, `is_body`;
 - what can be trusted: `Evidence`, `weigh`, `hardly_gains`, `limb_ends`, `end_motions`, `end_variances`,
-  `correlated_count`, `neighbor_correlation`, `dof_confidence`, `unseen_share`, `SurfaceError`; in words `spread_of`;
+  `correlated_count`, `neighbor_correlation`, `dof_confidence`, `unseen_share`, `overlap`, `own_shares`,
+  `SurfaceError`; in words `spread_of`;
 - checks of input: `check_skin`, `floating_origin`, `warn_about_units`, `warn_about_degenerate`;
 - numbers: `ANNEALING`, `CALIBRATION`, `CLUSTERS`, `INLIER_SHARE`, `INTRUSION`, `OFF_SURFACE`, `PRIOR_SHARE`,
   `SEARCH_BUDGET`, `SHAPE_CALIBRATION`, `SURFACE_FIT`, `UNITS`.
