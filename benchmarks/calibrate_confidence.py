@@ -59,7 +59,7 @@ LIMB_DATA = 30.0  # that only one limb explains: with fewer no picture is needed
 FAR, CUT_OFF = 0.4, 0.7  # of the size, between which poses tell nothing; of the data, at most
 # Of poses that explain as much one is right, which shapes without symmetry do not teach.
 RIVALS = [EVIDENCE_NAMES.index(name) for name in ("rival", "rival_share")]
-UNKNOWN, WRONG = EVIDENCE_NAMES.index("unknown"), 1.5  # times that a wrong pose counts: a lie costs more than a doubt
+UNKNOWN, WRONG = EVIDENCE_NAMES.index("unknown"), 2.0  # times that a wrong pose counts: a lie costs more than a doubt
 FIRST_SEED = 50_000  # of clouds and cut pictures: those before are measured by confidence.py
 
 

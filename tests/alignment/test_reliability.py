@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 import torchreg as tr
 from tests.alignment.conftest import DESCENT
 from tests.alignment.made import joint, shape_of, solid
-from torchreg.alignment.evidence.confidence import SurfaceResiduals, doubled_data, overlap
+from torchreg.alignment.evidence.confidence import SurfaceResiduals, doubled_data, end_spreads, overlap
 from torchreg.alignment.evidence.coverage import unseen_share
 from torchreg.alignment.evidence.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.evidence.reliability import CALIBRATION, EVIDENCE_NAMES
@@ -99,6 +99,28 @@ def test_what_is_hidden_and_what_rivals_a_pose_lower_its_confidence_in_proportio
     assert tied == 0
     odds = CALIBRATION.bias - CALIBRATION.weights[EVIDENCE_NAMES.index("overlap")]
     assert overlapping == pytest.approx(1 / (1 + math.exp(-odds)))
+
+
+def test_a_hidden_finger_spreads_by_its_own_joint_not_by_that_of_the_arm():
+    joints = [joint("body", -1), joint("arm", 0, (0, 0, 0), "revolute", (1.0, 0.0, 0.0), -1.5, 1.5)]
+    joints += [joint(name, 1, (0, place, 0.3), "revolute", (1.0, 0.0, 0.0), -1.5, 1.5)
+               for name, place in (("shown", -0.03), ("hidden", 0.03))]  # fmt: skip
+    solids = [solid("ellipsoid", (0.05, 0.04, 0.06)), solid("ellipsoid", (0.03, 0.02, 0.15), 0, 0, 0.15)]
+    solids += [solid("ellipsoid", (0.008, 0.008, 0.03), 0, 0, 0.03)] * 2
+    shape = shape_of(joints, solids, nu=0.003, dtype=torch.float64)
+    skin, pose = tr.sample_skin(shape, 600), shape.rest_pose()[None]
+    part, spreads = skin.weights.argmax(-1), []
+    for shown in (part < 3, part < 1):
+        data = (skin(pose)[0] + noise_of(len(skin), dtype=torch.float64))[shown][None]
+        problem = centered_problem(
+            skin, data, torch.ones(1, data.shape[1], dtype=torch.bool), pose, torch.zeros(1, 3, dtype=torch.float64),
+            prior_std=0.5, pose_atol=0.0,
+        )  # fmt: skip
+        spreads.append(end_spreads(problem, pose)[0])
+    assert float(spreads[0][:2].max()) < 0.005
+    # A finger of 6 cm that turns by half a radian, on an arm of 30 cm that may as well.
+    assert 0.01 < float(spreads[0][2]) < 0.06
+    assert float(spreads[1][2]) > 0.1
 
 
 def test_limbs_in_each_other_overlap_and_explain_data_twice():

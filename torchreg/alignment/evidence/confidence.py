@@ -155,7 +155,7 @@ def near_outlier_share(problem: AlignProblem, distance: Tensor, off: OffSurface 
 
 
 def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals | None = None) -> Tensor:
-    """Return the deviations (B, L) of the limbs' ends, metres; a limb without data of its own spreads by the prior."""
+    """Return the deviations (B, L) of the limbs' ends, metres; joints of limbs without data spread by the prior."""
     if problem.data.shape[-2] > EVIDENCE.num_data:
         problem, residuals = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None
     residuals = residuals or SurfaceResiduals.of(problem, pose)
@@ -164,11 +164,30 @@ def end_spreads(problem: AlignProblem, pose: Tensor, residuals: SurfaceResiduals
     prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
     variances = prior.reciprocal()
     variances[..., :BASE_DOFS] = 0
-    loose = (moves.square() * variances[..., None, None, :]).sum((-2, -1))
     covariance = _covariance(problem, pose, residuals, prior)
     fitted = end_variances(moves, covariance)
-    misplaced = residuals.misplaced(EVIDENCE.limb_data)
-    return (fitted + misplaced * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
+    # A limb may be anywhere, by its own joints, where neither data of it nor of what hangs on it show where it is.
+    limbs, misplaced = [limb for limb, _ in limb_points(problem.skin)], residuals.misplaced(EVIDENCE.limb_data)
+    if not limbs:
+        return fitted.clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
+    squares = moves.square().sum(-2) * variances.unsqueeze(-2)
+    loose = torch.stack([squares[..., limb.dofs].sum(-1) for limb in limbs], -1)
+    hidden = torch.stack([misplaced[..., hanging].prod(-1) for hanging in _hanging(limbs)], -1)
+    left = (loose @ hidden.unsqueeze(-1)).squeeze(-1)
+    return (fitted + (left - fitted * misplaced).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
+
+
+def _hanging(limbs: Sequence[Limb]) -> list[list[int]]:
+    """Return for each limb the numbers of those that hang on it, and its own."""
+    owner = {part: number for number, limb in enumerate(limbs) for part in limb.parts}
+    above = [owner.get(limb.bodies[0].parent, -1) for limb in limbs]
+    hanging: list[list[int]] = [[] for _ in limbs]
+    for number in range(len(limbs)):
+        each = number
+        while each >= 0:
+            hanging[each].append(number)
+            each = above[each]
+    return hanging
 
 
 def end_motions(skin: LinearBlendSkin, pose: Tensor, ends: Tensor) -> Tensor:
