@@ -14,6 +14,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._threads import one_thread
 from torchreg.alignment.align import align
+from torchreg.alignment.base.among_others import BaseWindow, agreement, base_windows, everything
 from torchreg.alignment.base.fit import (
     BASE_FIT,
     BaseFit,
@@ -45,10 +46,13 @@ from torchreg.solvers.robust import welsch_weight
 class _Numbers:
     """Numbers of a calibration."""
 
+    max_points: int = 1500  # of a frame: more add neighbors that err together
+    unseen: float = 2.0  # cost of a frame without data: the largest
     num_skin: int = 800  # points of the robot's surface in the search and against free space
     num_data: int = 600  # of each frame in fits of candidates, and by which its joints are compared with others
     least_seen: float = 0.2  # share of the side towards the camera that data show: a frame with less has no robot
     least_seen_in_hand: float = 0.02  # the same where the robot carries the camera, which shows little of it
+    least_agreeing: float = 0.4  # the same of whole pictures, less what lies before free space; wrong bases reach .31
     outlying: float = 0.5  # of the frames' median share, below which a frame is outlying
     gained: float = 0.04  # share of them that other joints of a frame explain beyond what they do of other frames
     least_gained: int = 12  # the same in data
@@ -106,23 +110,23 @@ def calibrate_base(
         given = read_frames(shape, frames, poses)
         part = _camera_part(shape, camera_link)
         skin = sample_skin(shape, _NUMBERS.num_skin)
-        size, surface = model_size(skin), fitted_surface(shape)
+        problem = BaseProblem.of(fitted_surface(shape), skin, model_size(skin), part)
         models = [PosedModel.of_skin(skin, frame.joints, part) for frame in given]
-        coarse = BaseProblem.of([frame.thinned(_NUMBERS.num_data) for frame in given], surface, skin, size, part)
-        base, lead = _best_base(coarse, models)
-        seen = seen_shares(base, given, models, size)
+        found = _best_base(problem, given, models)
+        whole, given = given, found.frames
+        seen = found.seen(whole, models, problem.size)
         least = _NUMBERS.least_seen if part is None else _NUMBERS.least_seen_in_hand
+        least = _NUMBERS.least_agreeing if found.is_whole else least
         used = (seen >= max(least, _NUMBERS.outlying * float(seen.median()))).tolist()
         kept = [frame for frame, is_used in zip(given, used, strict=True) if is_used]
-        problem = BaseProblem.of(kept or given, surface, skin, size, part)
-        fit = _fitted(problem, base, offsets)
+        fit = _fitted(problem.of_frames(kept or given), found.base, offsets)
         wrong = iter(_wrong_joints(shape, fit)) if kept else iter(())
         used = [is_used and not next(wrong) for is_used in used]
         if sum(used) < len(kept):
             kept = [frame for frame, is_used in zip(given, used, strict=True) if is_used]
-            fit = _fitted(BaseProblem.of(kept, surface, skin, size, part), fit.base, offsets)
+            fit = _fitted(problem.of_frames(kept), fit.base, offsets)
         outliers = tuple(number for number, is_used in enumerate(used) if not is_used)
-        return _result(fit, given, outliers, camera_link, is_lost=not kept, is_sole=lead > _NUMBERS.rival)
+        return _result(fit, given, outliers, camera_link, is_lost=not kept, is_sole=found.lead > _NUMBERS.rival)
 
 
 def _camera_part(shape: ArticulatedShape, link: str | None) -> int | None:
@@ -166,15 +170,50 @@ def _wrong_joints(shape: ArticulatedShape, fit: BaseFit) -> list[bool]:
     return (wrong & (len(gain) > 1)).tolist()
 
 
-def _best_base(problem: BaseProblem, models: Sequence[PosedModel]) -> tuple[Tensor, float]:
-    """Return the best base (4, 4) of a search, and its relative lead over the next."""
-    frames, size = problem.frames, problem.size
-    candidates, _ = search_base(frames, models, size)
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The best base (4, 4) of a search, its relative lead over the next, and the frames with the data around it."""
+
+    base: Tensor
+    lead: float
+    frames: list[BaseFrame]
+    is_whole: bool = False
+
+    def seen(self, frames: Sequence[BaseFrame], models: Sequence[PosedModel], size: float) -> Tensor:
+        """Return the share (T,) of the robot that frames show, less in whole pictures what lies before free space."""
+        if self.is_whole:
+            return agreement(self.base[None], frames, models, size)[0]
+        return seen_shares(self.base, self.frames, models, size)
+
+
+def _best_base(problem: BaseProblem, frames: Sequence[BaseFrame], models: Sequence[PosedModel]) -> _Found:
+    """Return the best of the bases in all windows of the frames' data."""
+    windows = base_windows(frames, models) if problem.camera_part is None else [everything(frames)]
+    is_whole = windows[0].ball is not None and all(frame.is_whole for frame in frames)
+    found = []
+    for window in windows:
+        bases, costs = _bases(problem, window, models)
+        missing = len(frames) - len(window.frames)
+        costs = (costs * len(window.frames) + _NUMBERS.unseen * missing) / len(frames)
+        if is_whole:
+            costs = 1 - agreement(bases, frames, models, problem.size).mean(-1)
+        found += [(float(cost), base, window) for cost, base in zip(costs, bases, strict=True)]
+    found.sort(key=lambda each: each[0])
+    cost, base, window = found[0]
+    lead = found[1][0] / cost - 1 if len(found) > 1 else float("inf")
+    near = window.near(frames, models, base, problem.size)
+    return _Found(base, lead, [frame.thinned(_NUMBERS.max_points) for frame in near], is_whole)
+
+
+def _bases(problem: BaseProblem, window: BaseWindow, models: Sequence[PosedModel]) -> tuple[Tensor, Tensor]:
+    """Return the bases (K, 4, 4) of a search in a window, best first, and their costs (K,)."""
+    frames = [frame.thinned(_NUMBERS.max_points) for frame in window.frames]
+    models, size = [models[number] for number in window.numbers], problem.size
+    coarse = problem.of_frames([frame.thinned(_NUMBERS.num_data) for frame in frames])
+    candidates, _ = search_base(coarse.frames, models, size)
     widths = narrowing(BASE_FIT.start, BASE_FIT.stop)
-    fitted = [base_of(approach_base(problem, problem.state(base), widths))[0] for base in candidates]
-    bases, costs = rank_bases(torch.stack(fitted), frames, models, size)
-    lead = float(costs[1] / costs[0]) - 1 if len(costs) > 1 else float("inf")
-    return bases[0], lead
+    fitted = [base_of(approach_base(coarse, coarse.state(base), widths))[0] for base in candidates]
+    return rank_bases(torch.stack(fitted), coarse.frames, models, size)
 
 
 def _result(

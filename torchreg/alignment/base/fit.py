@@ -65,17 +65,16 @@ class BaseProblem:
 
     @classmethod
     def of(
-        cls,
-        frames: Sequence[BaseFrame],
-        surface: ShapeSurface,
-        skin: LinearBlendSkin,
-        size: float,
-        camera_part: int | None = None,
+        cls, surface: ShapeSurface, skin: LinearBlendSkin, size: float, camera_part: int | None = None
     ) -> BaseProblem:
-        """Return the problem without offsets; ``camera_part`` is the number of the link that carries the camera."""
-        shares = tuple(independent_share(frame.points, size) for frame in frames)
+        """Return the problem without frames and offsets; ``camera_part`` is the link that carries the camera."""
         free = torch.zeros(skin.shape.num_dofs - BASE_DOFS, dtype=torch.bool)
-        return cls(tuple(frames), shares, surface, skin, size, free, camera_part)
+        return cls((), (), surface, skin, size, free, camera_part)
+
+    def of_frames(self, frames: Sequence[BaseFrame]) -> BaseProblem:
+        """Return the problem of other frames."""
+        shares = tuple(independent_share(frame.points, self.size) for frame in frames)
+        return replace(self, frames=tuple(frames), shares=shares)
 
     def state(self, base: Tensor) -> Tensor:
         """Return the state (1, 7 + J) of a base (4, 4) without offsets."""

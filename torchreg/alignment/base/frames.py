@@ -16,7 +16,6 @@ from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.loaded import as_points
-from torchreg.geometry.rigid import transform_points
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOFS
 
@@ -25,7 +24,6 @@ from torchreg.shapes.pose_algebra import BASE_DOFS
 class _Given:
     """Numbers of the checks of frames and joints."""
 
-    max_points: int = 1500  # of a frame: more add neighbors that err together
     beyond: float = math.radians(3)  # limits: encoders and descriptions differ by so much
     beyond_shift: float = 0.01  # the same of joints that slide, metres
     turn: float = 2 * math.pi  # angles beyond which numbers may be degrees
@@ -37,11 +35,47 @@ _GIVEN = _Given()
 
 @dataclass(frozen=True, eq=False)
 class BaseFrame:
-    """Points (M, 3) in camera coordinates, metres, joints (J,), and the free space of a depth picture, if any."""
+    """Points (M, 3) in camera coordinates, metres, joints (J,), and a depth picture and its free space, if any."""
 
     points: Tensor
     joints: Tensor
     free_space: FreeSpace | None = None
+    picture: DepthFrame | None = None
+
+    @classmethod
+    def of_picture(cls, frame: DepthFrame, joints: Tensor) -> BaseFrame:
+        """Return a frame with the points that count in a picture, and the free space outside of its mask, if any."""
+        given, depth = frame.camera, frame.depth.cpu()
+        camera = Camera(given.width, given.height, given.intrinsics, distortion=given.distortion)
+        mask = None if frame.mask is None else frame.mask.cpu()
+        picture = DepthFrame(depth, camera, mask, max_points=frame.max_points)
+        found = cls(picture.points.double(), joints, picture=picture)
+        return found if mask is None else found._with_space(mask)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is a picture all of whose pixels count."""
+        return self.picture is not None and self.picture.mask is None
+
+    def showing(self, pixels: Tensor) -> BaseFrame:
+        """Return the frame with some pixels (H, W) of its picture alone, free beside them and pixels without depth."""
+        assert self.picture is not None
+        shown = self.picture.cropped(pixels)
+        return replace(self, points=shown.points.double(), picture=shown)._with_space(pixels | ~self.picture.measured)
+
+    def _with_space(self, mask: Tensor) -> BaseFrame:
+        """Return the frame with the space outside of a mask (H, W), before what was measured there.
+
+        Inside data pull the surface already; their noise would push it away.
+        """
+        picture = self.picture
+        assert picture is not None
+        depth = torch.where(mask, 0.0, picture.depth)
+        return replace(self, free_space=FreeSpace.of_picture(depth.double(), picture.camera, mask, picture.stride))
+
+    def where(self, kept: Tensor) -> BaseFrame:
+        """Return the frame with some of its points (M,) alone."""
+        return replace(self, points=self.points[kept])
 
     def thinned(self, count: int) -> BaseFrame:
         """Return the frame with ``count`` of its points at most."""
@@ -73,15 +107,13 @@ def read_frames(shape: Articulation, frames: Any, poses: Any) -> list[BaseFrame]
     if not given:
         raise InputError("frames must hold at least one cloud or depth frame, got none")
     joints = read_joints(shape, poses, len(given))
-    found = [_read_frame(frame, row, number) for number, (frame, row) in enumerate(zip(given, joints, strict=True))]
-    return [frame.thinned(_GIVEN.max_points) for frame in found]
+    return [_read_frame(frame, row, number) for number, (frame, row) in enumerate(zip(given, joints, strict=True))]
 
 
 def _read_frame(frame: Any, joints: Tensor, number: int) -> BaseFrame:
     name = f"frames[{number}]"
     if isinstance(frame, DepthFrame):
-        motion = frame.camera.world_to_camera.to(frame.points.device, torch.float64)
-        return BaseFrame(transform_points(motion, frame.points.double()).cpu(), joints, _beside_mask(frame))
+        return BaseFrame.of_picture(frame, joints)
     points = as_float_tensor(as_points(frame), name).detach().cpu().double()
     check_shape(points, name, ("M", 3))
     points = points[points.isfinite().all(-1)]
@@ -90,16 +122,6 @@ def _read_frame(frame: Any, joints: Tensor, number: int) -> BaseFrame:
     # Clouds may be sorted by anything.
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
     return BaseFrame(points[order], joints)
-
-
-def _beside_mask(frame: DepthFrame) -> FreeSpace | None:
-    """Return the free space outside a frame's mask, in camera coordinates; None without a mask."""
-    if frame.mask is None:
-        return None
-    given = frame.camera
-    camera = Camera(given.width, given.height, given.intrinsics, distortion=given.distortion)
-    depth = torch.where(frame.mask, 0.0, frame.depth).cpu().double()
-    return FreeSpace.of_picture(depth, camera, frame.mask.cpu(), frame.stride)
 
 
 def read_joints(shape: Articulation, poses: Any, count: int) -> Tensor:

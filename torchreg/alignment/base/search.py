@@ -26,10 +26,11 @@ class _BaseSearch:
     """Numbers of the search; widths are shares of the model's size."""
 
     num_rotations: int = 300  # tried, 30 degrees apart
-    start: float = 0.15  # first kernel; after each, the better half of the candidates go on
+    start: float = 0.3  # first kernel; after each, the better half of the candidates go on
+    num_shifts: int = 3  # of each rotation, as many frames each ask for theirs
     steps: int = 2  # with each kernel
     num_data: int = 450  # of all frames together
-    num_kept: int = 3  # candidates returned, at most
+    num_kept: int = 8  # candidates returned, at most
     score_width: float = BASE_FIT.stop  # of the last kernel, by which candidates are ranked
     gap: float = 4.0  # typical angles between data, beyond which a model point is beside all that was seen
     same_turn: float = 0.2  # candidates whose bases differ by less are one, radians
@@ -102,7 +103,10 @@ def _drawn(frames: Sequence[BaseFrame]) -> Tensor:
 
 
 def _starts(data: Tensor, models: Sequence[PosedModel]) -> Tensor:
-    """Return candidates (K, 4, 4), the middle of the data on that of the model's side towards the camera."""
+    """Return candidates (K, 4, 4), the middle of the data on that of the model's side towards the camera.
+
+    The middle is that of all frames, and of some alone: of a part of the robot it is off.
+    """
     rotations = spread_rotations(_SEARCH.num_rotations)
     shifts = []
     for points, model in zip(data, models, strict=True):
@@ -111,7 +115,8 @@ def _starts(data: Tensor, models: Sequence[PosedModel]) -> Tensor:
         shown = (-(view @ model.normals.mT)).clamp_min(0)
         seen = shown @ model.points / shown.sum(-1, keepdim=True).clamp_min(1e-12)
         shifts.append(middle - (rotations @ seen.unsqueeze(-1)).squeeze(-1))
-    return rigid_matrix(rotations, torch.stack(shifts).median(0).values)
+    tried = [torch.stack(shifts).median(0).values, *(shifts[: _SEARCH.num_shifts] if len(shifts) > 1 else ())]
+    return rigid_matrix(rotations.repeat(len(tried), 1, 1), torch.cat(tried))
 
 
 def _step(candidates: Tensor, data: Tensor, models: Sequence[PosedModel], width: float) -> tuple[Tensor, Tensor]:

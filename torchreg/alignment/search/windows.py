@@ -46,7 +46,7 @@ class DataWindows(Generic[Problem]):
         """Return the windows of a batch: one where the data fit in it, and in crops of pictures."""
         whole = problem.factor(FreeSpaceTerm) is not None
         masks = [
-            [valid] if whole else _windows(points, valid, problem.size)
+            [valid] if whole else ball_windows(points, valid, _WINDOWING.radius * problem.size)
             for points, valid in zip(problem.data, problem.valid, strict=True)
         ]
         row = torch.arange(len(masks)).repeat_interleave(torch.tensor([len(several) for several in masks]))
@@ -61,13 +61,13 @@ class DataWindows(Generic[Problem]):
         return table.argmin(1)
 
 
-def _windows(data: Tensor, valid: Tensor, size: float) -> list[Tensor]:
-    """Return the masks (M,) of data (M, 3) in each window: of all where they fit in one."""
-    points, radius = data[valid], _WINDOWING.radius * size
+def ball_windows(data: Tensor, valid: Tensor, radius: float) -> list[Tensor]:
+    """Return the masks (M,) of data (M, 3) in balls around what is dense: of all where they fit in one."""
+    points, apart = data[valid], _WINDOWING.same / _WINDOWING.radius * radius
     if len(points) > _WINDOWING.neighbors:
         # Scattered outliers are no other thing.
-        apart = k_nearest_others(points, _WINDOWING.neighbors)[1].amax(-1)
-        points = points[apart <= _WINDOWING.dense * apart.median()]
+        gaps = k_nearest_others(points, _WINDOWING.neighbors)[1].amax(-1)
+        points = points[gaps <= _WINDOWING.dense * gaps.median()]
 
     def around(center: Tensor) -> Tensor:
         return ((data - center).norm(dim=-1) < radius) & valid
@@ -81,6 +81,6 @@ def _windows(data: Tensor, valid: Tensor, size: float) -> list[Tensor]:
     for center in points[farthest_points(points, min(_WINDOWING.centers, len(points)))]:
         for _ in range(_WINDOWING.moves):
             center = data[around(center)].mean(0)
-        if all(float((center - other).norm()) > _WINDOWING.same * size for other in centers):
+        if all(float((center - other).norm()) > apart for other in centers):
             centers.append(center)
     return [window for window in map(around, centers) if int(window.sum()) >= _WINDOWING.least] or [valid]
