@@ -27,6 +27,7 @@ _NAMES = {
     "alignment.train_initializer": "TrainingRow TrainInitializerConfig train_initializer",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",
     "capture.depth_frame": "DepthFrame",
+    "capture.background": "Background",
     "capture.moved": "MovedMasks moved_masks",
     "capture.silhouette_frames": "SilhouetteFrames",
     "capture.silhouettes": "visual_hull",

@@ -84,7 +84,8 @@ def calibrate_base(
     Args:
         shape: the robot, in metres.
         frames: T clouds (M, 3) in camera coordinates (right, down, forward), metres, or depth frames. Points of other
-            things are outliers; the search wants most points to be the robot's, as a mask gives.
+            things are outliers. Without masks the robot is sought in balls that it may fill, in whole pictures of a
+            camera that stands still by what moves between them, see `Background`: three or more are asked.
         poses: joints of each frame, metres and radians: (T, J) in the order of ``shape.dof_names[6:]``, (T, num_dofs),
             whose base is not used, or T dictionaries by name of joint; of any floating-point type.
         offsets: whether to look for constant offsets of the joints, too; those that the data do not tell stay zero.

@@ -21,6 +21,7 @@ class _Mixture:
     behind: float = 1e-3  # share of depths behind the background: errors of the camera, as at mirrors
     moving: float = 0.1  # first share of depths before it, which the pictures then tell
     rounds: int = 3  # of telling it
+    deviations: float = 4.0  # of the noise, within which two depths are one: one pixel in 16,000 is not, by chance
     most: int = 15  # pictures that tell the background, at most
     rim: int = 2  # pixels: what is thinner is the error of an edge
 
@@ -101,12 +102,16 @@ class Background:
         return torch.where((depths > 0) & (self.depth > 0), before / (before + rest), 0.0)
 
     def _likelihood(self, depths: Tensor) -> Tensor:
-        """Return the log-likelihood (H, W) of depths (T, H, W) if the background was this one."""
-        total = torch.where(self.depth > 0, 0.0, -torch.inf)
-        for depth in depths:
-            before, rest = self._densities(depth)
-            total = total + torch.where(depth > 0, (before + rest).log(), 0.0)
-        return total
+        """Return the log-likelihood (H, W) of depths (T, H, W) if the background was this one, but for a constant.
+
+        Things before it may rest, so one is as likely as many pictures of it; errors are of single pictures.
+        """
+        off = (depths - self.depth) / (self.noise * self.depth.square()).clamp_min(torch.finfo(depths.dtype).tiny)
+        measured = depths > 0
+        near, behind = measured & (off.abs() <= _MIXTURE.deviations), measured & (off > _MIXTURE.deviations)
+        hidden = (measured & ~near & ~behind).any(0)
+        total = near.sum(0) * math.log(1 - self.share) + behind.sum(0) * math.log(_MIXTURE.behind)
+        return torch.where(self.depth > 0, total + hidden * math.log(max(self.share, _MIXTURE.behind)), -torch.inf)
 
 
 def _depths(frame: DepthFrame) -> Tensor:
@@ -116,7 +121,7 @@ def _depths(frame: DepthFrame) -> Tensor:
 
 
 def _noise(depths: Tensor) -> float:
-    """Return the standard deviation of depths (T, H, W) at one metre, by what most pixels differ from picture to picture."""
+    """Return the standard deviation of depths (T, H, W) at one metre, by most differences between pictures."""
     first, second = depths[:-1], depths[1:]
     both = (first > 0) & (second > 0)
     off = ((second - first) / (0.5 * (first + second)).square().clamp_min(torch.finfo(depths.dtype).eps))[both]

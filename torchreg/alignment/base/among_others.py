@@ -55,7 +55,7 @@ class BaseWindow:
             found[number] = (
                 frame.where(belongs(frame.points))
                 if frame.picture is None
-                else frame.showing(_pixels(frame.picture, belongs))
+                else frame.showing(frame.picture, _pixels(frame.picture, belongs))
             )
         return found
 
@@ -66,12 +66,11 @@ def agreement(bases: Tensor, frames: Sequence[BaseFrame], models: Sequence[Posed
     That is the share of the robot's side towards the camera at which a picture shows it, less the share through which
     it shows something farther; what is hidden, out of the picture or not measured counts for neither.
     """
-    return torch.stack([_shown(bases, frame, model, size) for frame, model in zip(frames, models, strict=True)], dim=-1)
+    pictures = [frame.picture for frame in frames if frame.picture is not None]
+    return torch.stack([_shown(bases, *both, size) for both in zip(pictures, models, strict=True)], dim=-1)
 
 
-def _shown(bases: Tensor, frame: BaseFrame, model: PosedModel, size: float) -> Tensor:
-    picture = frame.picture
-    assert picture is not None
+def _shown(bases: Tensor, picture: DepthFrame, model: PosedModel, size: float) -> Tensor:
     posed, normals = transform_points(bases, model.points), (bases[:, :3, :3] @ model.normals.mT).mT
     faces = (posed * normals).sum(-1) < 0
     pixel, depth = picture.camera.project(posed)
@@ -122,8 +121,10 @@ def _moved(frames: Sequence[BaseFrame]) -> Sequence[BaseFrame]:
     background = Background.of(pictures)
     moved = [background.moved(picture) for picture in pictures]
     return [
-        frame.showing(pixels) if int(pixels.sum()) >= _AMONG.least else frame.where(torch.tensor([], dtype=torch.int64))
-        for frame, pixels in zip(frames, moved, strict=True)
+        frame.showing(picture, pixels)
+        if int(pixels.sum()) >= _AMONG.least
+        else frame.where(torch.tensor([], dtype=torch.int64))
+        for frame, picture, pixels in zip(frames, pictures, moved, strict=True)
     ]
 
 

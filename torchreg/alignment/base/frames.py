@@ -50,28 +50,26 @@ class BaseFrame:
         mask = None if frame.mask is None else frame.mask.cpu()
         picture = DepthFrame(depth, camera, mask, max_points=frame.max_points)
         found = cls(picture.points.double(), joints, picture=picture)
-        return found if mask is None else found._with_space(mask)
+        return found if mask is None else found._with_space(picture, mask)
 
     @property
     def is_whole(self) -> bool:
         """Whether it is a picture all of whose pixels count."""
         return self.picture is not None and self.picture.mask is None
 
-    def showing(self, pixels: Tensor) -> BaseFrame:
-        """Return the frame with some pixels (H, W) of its picture alone, free beside them and pixels without depth."""
-        assert self.picture is not None
-        shown = self.picture.cropped(pixels)
-        return replace(self, points=shown.points.double(), picture=shown)._with_space(pixels | ~self.picture.measured)
+    def showing(self, picture: DepthFrame, pixels: Tensor) -> BaseFrame:
+        """Return the frame with some pixels (H, W) of a picture alone, free beside them and pixels without depth."""
+        shown = picture.cropped(pixels)
+        return replace(self, points=shown.points.double())._with_space(shown, pixels | ~picture.measured)
 
-    def _with_space(self, mask: Tensor) -> BaseFrame:
+    def _with_space(self, picture: DepthFrame, mask: Tensor) -> BaseFrame:
         """Return the frame with the space outside of a mask (H, W), before what was measured there.
 
         Inside data pull the surface already; their noise would push it away.
         """
-        picture = self.picture
-        assert picture is not None
         depth = torch.where(mask, 0.0, picture.depth)
-        return replace(self, free_space=FreeSpace.of_picture(depth.double(), picture.camera, mask, picture.stride))
+        space = FreeSpace.of_picture(depth.double(), picture.camera, mask, picture.stride)
+        return replace(self, picture=picture, free_space=space)
 
     def where(self, kept: Tensor) -> BaseFrame:
         """Return the frame with some of its points (M,) alone."""
