@@ -23,6 +23,7 @@ from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
 from torchreg.alignment.train_initializer import TrainingRow as TrainingRow
 from torchreg.alignment.train_initializer import TrainInitializerConfig as TrainInitializerConfig
 from torchreg.alignment.train_initializer import train_initializer as train_initializer
+from torchreg.capture.background import Background as Background
 from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
 from torchreg.capture.depth import load_depth_scan as load_depth_scan
@@ -97,6 +98,7 @@ __all__ = [
     "AlignConfig",
     "AlignResult",
     "ArticulatedShape",
+    "Background",
     "BaseCalibration",
     "BendingSkin",
     "CalibrateConfig",
